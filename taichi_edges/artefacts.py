@@ -1,0 +1,47 @@
+"""Files are written under a temporary name and renamed, so a killed run never leaves half a file under a final name."""
+
+import contextlib
+import hashlib
+import json
+import os
+from pathlib import Path
+
+
+@contextlib.contextmanager
+def replacing(path):
+    """A temporary path beside `path` (same suffix) that takes its place when the block ends without an error."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{path.suffix}")
+    try:
+        yield unfinished
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def write_text(path, text):
+    """Write a text file, all of it or nothing."""
+    with replacing(path) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
+    return Path(path)
+
+
+def write_json(path, content):
+    """Write JSON, all of it or nothing; keys in the order given, floats with all their digits."""
+    return write_text(path, json.dumps(content, indent=1) + "\n")
+
+
+def digest_file(path):
+    """A short hash of a file's bytes."""
+    hasher = hashlib.blake2b(digest_size=16)
+    with open(path, "rb") as file:
+        while block := file.read(1 << 20):
+            hasher.update(block)
+    return hasher.hexdigest()
+
+
+def digest(content):
+    """A short hash of anything JSON can hold."""
+    text = json.dumps(content, sort_keys=True, default=str)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()

@@ -1,0 +1,104 @@
+"""EdgeSet: the parametric edges themselves, their samples, and the file `edges.json`."""
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+
+from taichi_edges.artefacts import write_json
+from taichi_edges.edges.bezier import bezier_lengths, evaluate_bezier
+from taichi_edges.errors import UserError
+
+
+@dataclass(frozen=True)
+class EdgeSet:
+    """Line segments and cubic Bezier curves.
+
+    lines:          (L, 2, 3) end points.
+    curves:         (C, 4, 3) control points.
+    line_sources:   (L,) int, which cluster a line came from, or -1.
+    curve_sources:  (C,) int, the same for curves. Pieces of one smooth curve (a circle is several cubics) share the
+                    number, so counting distinct sources counts edges.
+    """
+
+    lines: np.ndarray
+    curves: np.ndarray
+    line_sources: np.ndarray
+    curve_sources: np.ndarray
+
+    @staticmethod
+    def of(lines=(), curves=()):
+        """An EdgeSet in which every line and every curve is an edge of its own."""
+        lines = np.asarray(lines, dtype=np.float64).reshape(-1, 2, 3)
+        curves = np.asarray(curves, dtype=np.float64).reshape(-1, 4, 3)
+        return EdgeSet(lines, curves, np.arange(len(lines)), len(lines) + np.arange(len(curves)))
+
+    def __len__(self):
+        return len(self.lines) + len(self.curves)
+
+    @property
+    def lengths(self):
+        """(L + C,) arc lengths, lines first."""
+        return np.concatenate([np.linalg.norm(self.lines[:, 1] - self.lines[:, 0], axis=1), bezier_lengths(self.curves)])
+
+    def transformed(self, function):
+        """The same edges with `function`, (n, 3) -> (n, 3), an affine map, applied to every point."""
+        lines = function(self.lines.reshape(-1, 3)).reshape(-1, 2, 3)
+        curves = function(self.curves.reshape(-1, 3)).reshape(-1, 4, 3)
+        return EdgeSet(lines, curves, self.line_sources, self.curve_sources)
+
+    def polylines(self, curve_segments=32):
+        """One (m, 3) polyline for each edge, lines first."""
+        parameters = np.linspace(0.0, 1.0, curve_segments + 1)
+        return list(self.lines) + [evaluate_bezier(control, parameters) for control in self.curves]
+
+    def sample(self, spacing):
+        """Points at most `spacing` apart along every edge (both end points included), with unit tangents.
+
+        Returns points (n, 3), tangents (n, 3) and (n,) the index of the edge, lines first.
+        """
+        points, tangents, owners = [], [], []
+        for index, polyline in enumerate(self.polylines()):
+            steps = np.linalg.norm(np.diff(polyline, axis=0), axis=1)
+            arc = np.concatenate([[0.0], np.cumsum(steps)])
+            count = max(int(np.ceil(arc[-1] / spacing)), 1) + 1
+            at = np.linspace(0.0, arc[-1], count)
+            segment = np.clip(np.searchsorted(arc, at, side="right") - 1, 0, len(steps) - 1)
+            points.append(np.stack([np.interp(at, arc, polyline[:, axis]) for axis in range(3)], axis=1))
+            tangents.append((np.diff(polyline, axis=0) / np.maximum(steps, 1e-300)[:, None])[segment])
+            owners.append(np.full(count, index))
+        if not points:
+            return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64)
+        return np.concatenate(points), np.concatenate(tangents), np.concatenate(owners)
+
+
+def write_edges(path, edges, about):
+    """Write `edges.json`: EMAP's keys `curves_ctl_pts` (n, 4, 3) and `lines_end_pts` (n, 2, 3), and keys of our own.
+
+    edges: EdgeSet in the frame of the input. about: dict of further top-level keys (counts, units), JSON values only.
+    """
+    content = {
+        "curves_ctl_pts": edges.curves.tolist(),
+        "lines_end_pts": edges.lines.tolist(),
+        "curve_sources": edges.curve_sources.tolist(),
+        "line_sources": edges.line_sources.tolist(),
+        **about,
+    }
+    return write_json(path, content)
+
+
+def read_edges(path):
+    """Read an `edges.json` of ours or of EMAP's (which has no sources: there every piece is an edge of its own).
+
+    Returns the EdgeSet and the dict of all the other keys.
+    """
+    try:
+        with open(path, encoding="utf-8") as file:
+            content = json.load(file)
+        edges = EdgeSet.of(content.pop("lines_end_pts"), content.pop("curves_ctl_pts"))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path}: not an edge file ({error}); it needs curves_ctl_pts and lines_end_pts") from error
+    if "line_sources" in content:
+        sources = [np.asarray(content.pop(key), dtype=np.int64) for key in ("line_sources", "curve_sources")]
+        edges = EdgeSet(edges.lines, edges.curves, *sources)
+    return edges, content

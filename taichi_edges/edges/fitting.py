@@ -1,0 +1,172 @@
+"""One parametric edge for each cluster: a line segment, or a smooth chain of cubic Bezier curves (paper 3.3)."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.interpolate import BSpline, make_lsq_spline
+from scipy.spatial import cKDTree
+
+from taichi_edges.edges.bezier import evaluate_bezier
+from taichi_edges.edges.edge_set import EdgeSet
+from taichi_edges.edges.ordering import order_points
+
+ROBUST_ROUNDS = 10
+REPARAMETRIZATIONS = 4
+TURN_PER_CUBIC = np.radians(100.0)  # one cubic follows a circular arc of 90 degrees to 3e-4 of the radius
+END_QUANTILE = 0.01  # of the points along a line: its ends, so that one stray point does not lengthen it
+CURVE_SAMPLES = 128  # for each cubic, where distances to a curve are measured
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What became of one cluster: 'line', 'curve', 'loop' (a closed curve), 'short' or 'degenerate'."""
+
+    kind: str
+    line: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 3)))
+    curves: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 3)))
+
+
+def fit_clusters(points, labels, config):
+    """Fit every cluster.
+
+    points: (n, 3) unit cube. labels: (n,) cluster of each point, -1 for none. config: the scene's `fit` section.
+    Returns the EdgeSet (sources are the labels) and the dict kind -> number of clusters.
+    """
+    lines, curves, line_sources, curve_sources = [], [], [], []
+    counts = dict.fromkeys(("line", "curve", "loop", "short", "degenerate"), 0)
+    for label in range(labels.max(initial=-1) + 1):
+        fit = fit_cluster(points[labels == label], config)
+        counts[fit.kind] += 1
+        if fit.kind == "line":
+            lines.append(fit.line)
+            line_sources.append(label)
+        elif fit.kind in ("curve", "loop"):
+            curves.extend(fit.curves)
+            curve_sources.extend([label] * len(fit.curves))
+    edges = EdgeSet.of(lines, curves)
+    sources = (np.array(line_sources, dtype=np.int64), np.array(curve_sources, dtype=np.int64))
+    return EdgeSet(edges.lines, edges.curves, *sources), counts
+
+
+def fit_cluster(points, config):
+    """Fit (n, 3) points: the curve is kept when its mean distance e_c <= delta * e_l, the line's (paper 3.3)."""
+    if len(np.unique(points, axis=0)) < 2:
+        return Fit("degenerate")
+    line, line_error = fit_line(points, config.line_tolerance)
+    if len(points) >= 4:
+        ordering = order_points(points)
+        curves, curve_error = fit_curve(points, ordering, config.line_tolerance)
+        long_enough = np.linalg.norm(np.diff(evaluate_bezier(curves, [0, 0.5, 1]), axis=1), axis=2).sum()
+        if curve_error <= config.delta * line_error and long_enough >= config.min_length:
+            return Fit("loop" if ordering.closed else "curve", curves=curves)
+    if np.linalg.norm(line[1] - line[0]) < config.min_length:
+        return Fit("short")
+    return Fit("line", line=line)
+
+
+def fit_line(points, tolerance):
+    """Robust line segment through (n, 3) points: iteratively reweighted least squares (Geman-McClure).
+
+    tolerance: distance at which a point's weight has fallen to a quarter.
+    Returns end points (2, 3) and the mean distance of all points to the line.
+    """
+    weights = np.ones(len(points))
+    for _ in range(ROBUST_ROUNDS):
+        centre = weights @ points / weights.sum()
+        offsets = points - centre
+        direction = np.linalg.svd(offsets * np.sqrt(weights)[:, None], full_matrices=False)[2][0]
+        along = offsets @ direction
+        distances = np.linalg.norm(offsets - along[:, None] * direction, axis=1)
+        weights = 1.0 / (1.0 + (distances / tolerance) ** 2) ** 2
+    inliers = along[weights >= 0.25] if (weights >= 0.25).sum() >= 2 else along
+    ends = np.quantile(inliers, [END_QUANTILE, 1 - END_QUANTILE]) if len(inliers) > 2 else np.sort(inliers)
+    return centre + ends[:, None] * direction, float(distances.mean())
+
+
+def fit_curve(points, ordering, tolerance):
+    """Chain of cubic Beziers through (n, 3) points by robust least squares over the arc-length parameter.
+
+    The chain is a cubic B-spline (hence smooth at its joints), cut into its Bezier pieces; as many pieces as the
+    points' total turning asks for. Returns control points (m, 4, 3) and the mean distance of all points to the chain.
+    """
+    arc, length, closed = ordering.arc, ordering.length, ordering.closed
+    turning = 2 * np.pi if closed else total_turning(points, arc)
+    pieces = max(int(np.ceil(turning / TURN_PER_CUBIC)), 4 if closed else 1)
+    pieces = min(pieces, max(len(points) // 6, 1))
+    weights = np.ones(len(points))
+    for _ in range(REPARAMETRIZATIONS):
+        curves = _fit_spline(points, arc / length, weights, pieces, closed)
+        distances, parameters = nearest_on_chain(points, curves)
+        arc = _reparametrize(arc, parameters, length, closed)
+        weights = 1.0 / (1.0 + (distances / tolerance) ** 2) ** 2
+    return curves, float(distances.mean())
+
+
+def total_turning(points, arc):
+    """Radians by which the tangent turns along ordered points, after averaging over a tenth of the length."""
+    stations = np.linspace(arc.min(), arc.max(), 12)
+    width = stations[1] - stations[0]
+    kernel = np.exp(-0.5 * ((stations[:, None] - arc) / width) ** 2)
+    centres = kernel @ points / kernel.sum(axis=1, keepdims=True)
+    steps = np.diff(centres[1:-1], axis=0)
+    steps /= np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-300)
+    return float(np.arccos(np.clip((steps[1:] * steps[:-1]).sum(axis=1), -1, 1)).sum() * 11 / 8)
+
+
+def _fit_spline(points, parameters, weights, pieces, closed):
+    """Least-squares cubic B-spline over parameters in 0..1 with `pieces` equal knot spans -> (pieces, 4, 3) Beziers."""
+    knots = np.linspace(0.0, 1.0, pieces + 1)
+    if closed:  # the data repeated on both sides make the middle period periodic
+        parameters = np.concatenate([parameters - 1, parameters, parameters + 1])
+        points, weights = np.tile(points, (3, 1)), np.tile(weights, 3)
+        knots = np.concatenate([knots[:-1] - 1, knots[:-1], knots + 1])
+    order = np.argsort(parameters, kind="stable")
+    spline = _lsq_spline(parameters[order], points[order], weights[order], knots)
+    controls = _hermite_to_bezier(spline(knots), spline.derivative()(knots), np.diff(knots))
+    if not closed:
+        return controls
+    controls = controls[pieces : 2 * pieces].copy()
+    joint = 0.5 * (controls[0, 0] + controls[-1, 3])
+    controls[0, 0] = controls[-1, 3] = joint
+    return controls
+
+
+def _hermite_to_bezier(values, derivatives, spans):
+    """Cubics with the given values (m + 1, 3) and derivatives (m + 1, 3) at the ends of m spans -> (m, 4, 3)."""
+    thirds = spans[:, None] / 3
+    first, last = values[:-1], values[1:]
+    return np.stack([first, first + derivatives[:-1] * thirds, last - derivatives[1:] * thirds, last], axis=1)
+
+
+def _lsq_spline(parameters, points, weights, knots):
+    """make_lsq_spline, or a ridge-regularised fit where a knot span has too few points for it."""
+    clamped = np.concatenate([[knots[0]] * 3, knots, [knots[-1]] * 3])
+    inside = np.clip(parameters, knots[0], knots[-1])
+    try:
+        return make_lsq_spline(inside, points, clamped, k=3, w=np.sqrt(weights))
+    except (ValueError, np.linalg.LinAlgError):
+        design = BSpline.design_matrix(inside, clamped, 3).toarray() * np.sqrt(weights)[:, None]
+        bend = np.diff(np.eye(design.shape[1]), 2, axis=0) * 1e-3 * np.sqrt(weights.sum())
+        targets = np.concatenate([points * np.sqrt(weights)[:, None], np.zeros((len(bend), 3))])
+        solution = np.linalg.lstsq(np.concatenate([design, bend]), targets, rcond=None)[0]
+        return BSpline(clamped, solution, 3)
+
+
+def nearest_on_chain(points, curves):
+    """Distances (n,) of points to a chain of cubics, and the chain parameter (piece + t) of the nearest sample."""
+    t = np.linspace(0.0, 1.0, CURVE_SAMPLES)
+    samples = evaluate_bezier(curves, t).reshape(-1, 3)
+    parameters = (np.arange(len(curves))[:, None] + t).ravel()
+    distances, nearest = cKDTree(samples).query(points)
+    return distances, parameters[nearest]
+
+
+def _reparametrize(arc, parameters, length, closed):
+    """Arc lengths moved to the nearest points of the chain; the ends of an open chain keep the whole range in use."""
+    pieces = max(np.ceil(parameters.max()), 1.0)
+    moved = parameters / pieces * length
+    if closed:  # a nearest sample on the other side of the joint is the same place, one period on
+        moved += np.round((arc - moved) / length) * length
+        return np.clip(moved, 0.0, length)
+    spread = moved.max() - moved.min()
+    return (moved - moved.min()) / max(spread, 1e-300) * length

@@ -1,0 +1,23 @@
+"""The one exception for everything a user can cause and put right."""
+
+import difflib
+
+
+class UserError(Exception):
+    """A mistake in the input. Its text is one line: where (file, key, view), what is wrong, what to do.
+
+    `run.py` prints it without a traceback and exits with status 2.
+    """
+
+
+def did_you_mean(name, known):
+    """'; did you mean 'position'?' for the known name nearest to `name`, or '' where none is near."""
+    near = difflib.get_close_matches(str(name), [str(k) for k in known], n=1, cutoff=0.5)
+    return f"; did you mean '{near[0]}'?" if near else ""
+
+
+def name_some(names, most=5):
+    """'a, b, c and 4 more': a list short enough for one line."""
+    names = [str(name) for name in names]
+    rest = len(names) - most
+    return ", ".join(names) if rest <= 0 else f"{', '.join(names[:most])} and {rest} more"

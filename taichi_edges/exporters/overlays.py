@@ -1,0 +1,209 @@
+"""PNG pictures of the edges drawn over the views, for people to judge the result by eye."""
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from taichi_edges.artefacts import replacing
+from taichi_edges.cameras import NEAR
+from taichi_edges.errors import UserError
+from taichi_edges.exporters.line_sets import line_set_arrays
+from taichi_edges.exporters.palette import CURVE_COLOUR, LINE_COLOUR
+
+OVERSAMPLING = 4  # the edges are drawn so many times larger and averaged
+SUBPIXEL_BITS = 4  # OpenCV draws in units of 1/16 pixel
+LINE_WIDTH = 2.5  # pixels at REFERENCE_WIDTH
+DOT_WIDTH = 2.2  # diameter of an end point, in line widths
+DOT_COLOUR = (30, 30, 30)
+FADED_TO = 0.35  # how dark an edge pixel of the map is drawn, 1 = black
+IMAGE_FADE = 0.35  # how far the colour image is mixed with white, so that the edges stand out
+REFERENCE_WIDTH = 800  # pixels; strokes and letters grow with wider images
+SHEET_WIDTH = 1600  # pixels; a contact sheet is scaled down to this
+SHEET_GAP = 8  # pixels
+TEXT_COLOUR = (40, 40, 40)
+SAME_SHAPE = 0.01  # an image whose aspect is off by more is not a picture of this view
+
+
+def draw_overlays(folder, views, edges_unit, count=4):
+    """Draw the edges over `count` views that look in different directions, one PNG each.
+
+    Over the view's colour image where there is a readable one, else over its edge map, faded. Hidden edges are drawn
+    too. The picture is the view, pixel for pixel, with a caption below it.
+
+    folder: where the files go. views: Views. edges_unit: EdgeSet in the unit cube. Returns the paths, by view.
+    """
+    paths = []
+    for view in choose_views(views, count):
+        picture = draw_edges(background(views, view), views.intrinsics[view] @ views.world_to_camera[view], edges_unit)
+        safe_name = re.sub(r"[^\w.-]+", "_", views.names[view])
+        paths.append(Path(folder) / f"overlay_{view:04d}_{safe_name}.png")
+        _write_png(paths[-1], np.concatenate([picture, caption(views.width, views.names[view], edges_unit)]))
+    return paths
+
+
+def contact_sheet(paths, out):
+    """Put pictures (paths, at least one, all of one size) side by side into one PNG, `out`, row by row."""
+    pictures = [_read_colour(path) for path in paths]
+    for path, picture in zip(paths, pictures, strict=True):
+        if picture is None:
+            raise UserError(f"{path}: not a readable picture; run the export again")
+    columns = int(np.ceil(np.sqrt(len(pictures))))
+    rows = -(-len(pictures) // columns)
+    shrink = min(1.0, SHEET_WIDTH / (columns * pictures[0].shape[1]))
+    height, width = (max(round(side * shrink), 1) for side in pictures[0].shape[:2])
+    pitch_y, pitch_x = height + SHEET_GAP, width + SHEET_GAP
+    sheet = np.full((rows * pitch_y + SHEET_GAP, columns * pitch_x + SHEET_GAP, 3), 255, np.uint8)
+    for index, picture in enumerate(pictures):
+        top, left = SHEET_GAP + index // columns * pitch_y, SHEET_GAP + index % columns * pitch_x
+        tile = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+        sheet[top : top + height, left : left + width] = tile
+    _write_png(out, sheet)
+    return Path(out)
+
+
+def choose_views(views, count):
+    """Indices, in order, of at most `count` views: the first, then always the one farthest from those chosen.
+
+    Far is by the angle between viewing directions; where all look the same way, by the place in the sequence.
+    """
+    directions = views.world_to_camera[:, 2, :3]
+    order = np.arange(len(views))
+    chosen, nearest = [], np.full(len(views), np.inf)
+    for _ in range(min(count, len(views))):
+        chosen.append(int(np.argmax(nearest)))
+        angles = np.arccos(np.clip(directions @ directions[chosen[-1]], -1.0, 1.0))
+        # A thousandth of a radian for the sequence decides between equal angles and no others.
+        nearest = np.minimum(nearest, angles + 1e-3 * np.abs(order - chosen[-1]) / len(views))
+        nearest[chosen] = -1.0
+    return sorted(chosen)
+
+
+def background(views, view):
+    """What is drawn on: (H, W, 3) uint8 BGR, the colour image of the view or its edge map, mixed with white."""
+    colour = _read_colour(views.image_paths[view]) if views.image_paths[view] else None
+    if colour is not None:
+        height, width = colour.shape[:2]
+        if abs(width * views.height / (height * views.width) - 1.0) < SAME_SHAPE:
+            resized = cv2.resize(colour, (views.width, views.height), interpolation=cv2.INTER_AREA)
+            return (resized + IMAGE_FADE * (255.0 - resized)).round().astype(np.uint8)
+    faded = 255.0 - FADED_TO * views.edge_maps[view]
+    return np.repeat(faded.round().astype(np.uint8)[:, :, None], 3, axis=2)
+
+
+def draw_edges(picture, projection, edges):
+    """Draw anti-aliased edges and their end points on a (H, W, 3) uint8 BGR picture, in place; returns it.
+
+    projection: (3, 4) intrinsics @ world_to_camera. edges: EdgeSet in the world of the projection.
+    """
+    height, width = picture.shape[:2]
+    stroke = LINE_WIDTH * max(width / REFERENCE_WIDTH, 0.5)
+    vertices, segments, owners = line_set_arrays(edges)
+    homogeneous = vertices @ projection[:, :3].T + projection[:, 3]
+    planes = frustum_planes(width, height, margin=2 * stroke)
+    for is_curve, colour in ((False, LINE_COLOUR), (True, CURVE_COLOUR)):
+        of_kind = segments[(owners >= len(edges.lines)) == is_curve]
+        _paint(picture, colour, clip_segments(homogeneous[of_kind], planes), stroke)
+    ends = homogeneous[_end_vertices(segments, owners)]
+    visible = (ends[:, 2] >= NEAR) & (ends @ planes.T >= 0).all(axis=1)
+    _paint(picture, DOT_COLOUR, np.repeat(ends[visible, None], 2, axis=1), DOT_WIDTH * stroke)
+    return picture
+
+
+def frustum_planes(width, height, margin):
+    """(5, 3) planes: a . (uz, vz, z) >= 0 holds in the visible region. Near (at depth 0), left, right, top, bottom.
+
+    margin: pixels around the image that still count, so that no round line cap shows inside it.
+    """
+    right, bottom = width - 1 + margin, height - 1 + margin
+    return np.array([[0, 0, 1], [1, 0, margin], [-1, 0, right], [0, 1, margin], [0, -1, bottom]], dtype=np.float64)
+
+
+def clip_segments(segments, planes):
+    """Cut segments to the visible region before the division by depth, so that nothing wraps round behind the camera.
+
+    segments: (m, 2, 3) homogeneous pixels (uz, vz, z). planes: (5, 3). Returns the visible parts, (k, 2, 3).
+    """
+    values = segments @ planes.T  # (m, 2, 5) signed distances
+    values[:, :, 0] -= NEAR  # not 0, where the division by depth ends
+    start, end = values[:, 0], values[:, 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = start / (start - end)
+    first = np.where((start < 0) & (end >= 0), crossing, 0.0).max(axis=1)
+    last = np.where((start >= 0) & (end < 0), crossing, 1.0).min(axis=1)
+    kept = (first < last) & ~((start < 0) & (end < 0)).any(axis=1)
+    at = np.stack([first, last], axis=1)[kept, :, None]
+    return segments[kept, :1] * (1.0 - at) + segments[kept, 1:] * at
+
+
+def caption(width, name, edges):
+    """The strip below the picture, (h, width, 3) uint8 BGR: the view's name on the left, the legend on the right."""
+    scale = max(0.5 * width / REFERENCE_WIDTH, 0.4)
+    thickness = max(round(2 * scale), 1)
+    letter = cv2.getTextSize("0", cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)[0]
+    strip = np.full((3 * letter[1], width, 3), 245, np.uint8)
+    baseline, right = 2 * letter[1], width - letter[0]
+    for colour, words in ((CURVE_COLOUR, f"curves {len(edges.curves)}"), (LINE_COLOUR, f"lines {len(edges.lines)}")):
+        right -= cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)[0][0]
+        _write(strip, words, (right, baseline), scale)
+        middle = (right - letter[0] // 2, baseline - letter[1] // 2)
+        right = middle[0] - 2 * letter[0]
+        cv2.line(strip, (right, middle[1]), middle, colour[::-1], 2 * thickness, cv2.LINE_AA)
+        right -= 2 * letter[0]
+    fitting = max((right - letter[0]) // letter[0], 0)
+    _write(strip, name[:fitting], (letter[0], baseline), scale)
+    return strip
+
+
+def _write(picture, words, origin, scale):
+    """Letters with their lower left corner at `origin`, (x, y) pixels."""
+    thickness = max(round(2 * scale), 1)
+    cv2.putText(picture, words, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, TEXT_COLOUR, thickness, cv2.LINE_AA)
+
+
+def _paint(picture, colour, segments, stroke):
+    """Paint segments, (m, 2, 3) homogeneous pixels, `stroke` pixels wide, with round ends; a point becomes a dot.
+
+    Through an oversampled mask: OpenCV's own anti-aliasing thickens a curve wherever two of its chords overlap.
+    """
+    height, width = picture.shape[:2]
+    mask = np.zeros((height * OVERSAMPLING, width * OVERSAMPLING), np.uint8)
+    fine = OVERSAMPLING * segments[..., :2] / segments[..., 2:] + 0.5 * (OVERSAMPLING - 1)
+    for start, end in np.rint(fine * 2**SUBPIXEL_BITS).astype(int).tolist():
+        cv2.line(mask, start, end, 255, round(stroke * OVERSAMPLING), cv2.LINE_8, SUBPIXEL_BITS)
+    coverage = cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA)
+    touched = coverage > 0
+    alpha = coverage[touched, None] / 255.0
+    picture[touched] = (picture[touched] * (1.0 - alpha) + np.array(colour[::-1]) * alpha).round()
+
+
+def _end_vertices(segments, owners):
+    """The first and last vertex of every edge, from the segments (m, 2) and their edges (m,)."""
+    changes = np.flatnonzero(np.diff(owners))
+    first, last = np.concatenate([[0], changes + 1]), np.concatenate([changes, [len(owners) - 1]])
+    return np.concatenate([segments[first, 0], segments[last, 1]]) if len(owners) else np.zeros(0, np.int64)
+
+
+def _read_colour(path):
+    """A picture as (H, W, 3) uint8 BGR, a transparent one on white; None where it cannot be read."""
+    try:
+        picture = cv2.imdecode(np.frombuffer(Path(path).read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    except (OSError, cv2.error):  # not there, not ours to read, or empty
+        return None
+    if picture is None or picture.dtype not in (np.uint8, np.uint16):
+        return None
+    picture = picture.astype(np.float64) * (255.0 / np.iinfo(picture.dtype).max)
+    picture = np.atleast_3d(picture)
+    if picture.shape[2] == 4:
+        alpha = picture[:, :, 3:] / 255.0
+        picture = picture[:, :, :3] * alpha + 255.0 * (1.0 - alpha)
+    return np.broadcast_to(picture, (*picture.shape[:2], 3)).round().astype(np.uint8)
+
+
+def _write_png(path, picture):
+    """Write (H, W, 3) uint8 BGR as a PNG, all of it or nothing."""
+    written, content = cv2.imencode(".png", picture)
+    assert written
+    with replacing(path) as unfinished:
+        unfinished.write_bytes(content.tobytes())

@@ -1,0 +1,1 @@
+"""Differentiable splatting of edge Gaussians with Taichi. Arrays in, arrays out: no files and no YAML in this room."""

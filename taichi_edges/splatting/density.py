@@ -1,0 +1,70 @@
+"""Density control: which Gaussians go, which are doubled. Optimiser moments are carried along (NumPy, between steps)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taichi_edges.splatting.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class Population:
+    """Gaussians with Adam's two moments, (n, 11) each, and the positional gradients since the last change, (n,)."""
+
+    gaussians: Gaussians
+    first_moments: np.ndarray
+    second_moments: np.ndarray
+    positional_gradients: np.ndarray
+
+    def __len__(self):
+        return len(self.gaussians)
+
+    def keep(self, chosen):
+        """Only the chosen ones, with their moments. chosen: (n,) bool or indices."""
+        return Population(
+            self.gaussians[chosen],
+            self.first_moments[chosen],
+            self.second_moments[chosen],
+            self.positional_gradients[chosen],
+        )
+
+
+def cull_opacity(population, minimum):
+    """Those with at least this opacity."""
+    return population.keep(population.gaussians.opacities >= minimum)
+
+
+def cull_support(population, views, minimum, threshold):
+    """Those whose centre falls on an edge pixel in at least this share of the views that have it in the image."""
+    on_edge, seen = views.edge_support(population.gaussians.means.astype(np.float64), threshold)
+    return population.keep(on_edge >= minimum * np.maximum(seen, 1))
+
+
+def duplicate(population, share, copies, distance, maximum, generator):
+    """Copies of the Gaussians that the image pulls at most, moved by a normal offset, with moments of zero.
+
+    share: the relative gradient from which on a Gaussian is copied: gradients are scaled to 0..1 over all Gaussians
+    at that moment, as the release of EdgeGaussians does, because their absolute size depends on the image.
+    copies: per Gaussian. distance: standard deviation of the offset, unit-cube units. maximum: Gaussians in all.
+    """
+    gradients = population.positional_gradients
+    spread = float(np.ptp(gradients)) if len(population) else 0.0
+    if spread == 0.0 or copies == 0:
+        return population
+    chosen = np.flatnonzero((gradients - gradients.min()) / spread > share)
+    chosen = np.tile(chosen, copies)[: max(maximum - len(population), 0)]
+    source = population.gaussians[chosen]
+    offset = generator.normal(size=(len(chosen), 3)).astype(np.float32) * np.float32(distance)
+    parts = [
+        (population.gaussians.means, source.means + offset),
+        (population.gaussians.log_scales, source.log_scales),
+        (population.gaussians.quaternions, source.quaternions),
+        (population.gaussians.opacity_logits, source.opacity_logits),
+    ]
+    zeros = np.zeros((len(chosen), 11), population.first_moments.dtype)
+    return Population(
+        Gaussians(*(np.concatenate(pair) for pair in parts)),
+        np.concatenate([population.first_moments, zeros]),
+        np.concatenate([population.second_moments, zeros]),
+        np.concatenate([gradients, np.zeros(len(chosen), gradients.dtype)]),
+    )

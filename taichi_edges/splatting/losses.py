@@ -1,0 +1,102 @@
+"""Losses of the paper, differentiated by Taichi: L_proj (eq. 3), L_orient (eq. 4), L_shape (eq. 5), summed as in eq. 6."""
+
+import numpy as np
+import taichi as ti
+
+from taichi_edges.splatting.projection import rotation
+
+
+def make_image_loss(selection, loss):
+    """Kernel image_loss(slots): loss += sum over the slots of weight * |C - target|, C = 1 - T (eq. 3)."""
+    weights, targets, transmittance = selection.weights, selection.targets, selection.transmittance
+
+    @ti.kernel
+    def image_loss(slots: ti.i32):
+        for slot in range(slots):
+            loss[None] += weights[slot] * ti.abs(1.0 - transmittance[slot] - targets[slot])
+
+    return image_loss
+
+
+class NeighborFields:
+    """The k nearest neighbours of every Gaussian, and who has whom for a neighbour.
+
+    The neighbours' means are copied to a field of their own, so that their share of the gradient can be gathered in a
+    fixed order: scattered with atomics, the last bits of a sum would depend on which thread came first.
+    """
+
+    def __init__(self, capacity, k, real=ti.f32):
+        self.capacity, self.k = capacity, k
+        self.indices = ti.field(ti.i32, shape=(capacity, k))
+        self.means = ti.Vector.field(3, real, shape=(capacity, k), needs_grad=True)
+        self.user_starts = ti.field(ti.i32, shape=capacity + 1)  # users of i: users[user_starts[i] : user_starts[i + 1]]
+        self.users = ti.field(ti.i32, shape=capacity * k)  # flat positions into (capacity, k)
+
+    def load(self, neighbors):
+        """neighbors: (n, k) int indices of the nearest other Gaussians."""
+        count = len(neighbors)
+        indices = np.zeros((self.capacity, self.k), np.int32)
+        indices[:count] = neighbors
+        users = np.zeros(self.capacity * self.k, np.int32)
+        users[: count * self.k] = np.argsort(neighbors.ravel(), kind="stable")
+        used = np.bincount(neighbors.ravel(), minlength=self.capacity)
+        self.indices.from_numpy(indices)
+        self.users.from_numpy(users)
+        self.user_starts.from_numpy(np.concatenate([[0], np.cumsum(used)]).astype(np.int32))
+        self.means.grad.fill(0)
+
+
+def make_regularizers(gaussians, neighbors, loss):
+    """copy_neighbors(count) and regularize(count, orient_weight, shape_weight), for the tape in this order.
+
+    L_orient as the text of 3.2 defines it: the principal direction d_i points towards the k nearest neighbours,
+    1 - mean |d_i . (mu_i - mu_j)| / |mu_i - mu_j|. L_shape: the mean ratio of the second largest to the largest scale.
+    """
+    means, log_scales, quaternions = gaussians.means, gaussians.log_scales, gaussians.quaternions
+    indices, neighbor_means = neighbors.indices, neighbors.means
+    users, user_starts, k = neighbors.users, neighbors.user_starts, neighbors.k
+
+    @ti.kernel
+    def copy(count: ti.i32):
+        for i in range(count):
+            for j in ti.static(range(k)):
+                neighbor_means[i, j] = means[indices[i, j]]
+
+    @ti.kernel
+    def gather(count: ti.i32):
+        for i in range(count):
+            total = ti.Vector.zero(gaussians.real, 3)
+            for position in range(user_starts[i], user_starts[i + 1]):
+                user = users[position]
+                total += neighbor_means.grad[user // k, user % k]
+                neighbor_means.grad[user // k, user % k] = ti.Vector.zero(gaussians.real, 3)
+            means.grad[i] += total
+
+    @ti.ad.grad_replaced
+    def copy_neighbors(count):
+        copy(count)
+
+    @ti.ad.grad_for(copy_neighbors)
+    def copy_neighbors_adjoint(count):
+        gather(count)
+
+    @ti.kernel
+    def regularize(count: ti.i32, orient_weight: gaussians.real, shape_weight: gaussians.real):
+        for i in range(count):
+            axes = rotation(quaternions[i])
+            s = ti.exp(log_scales[i])
+            direction = ti.Vector([axes[0, 0], axes[1, 0], axes[2, 0]])
+            largest, second = s[0], ti.max(s[1], s[2])
+            if s[1] > s[0] and s[1] >= s[2]:
+                direction = ti.Vector([axes[0, 1], axes[1, 1], axes[2, 1]])
+                largest, second = s[1], ti.max(s[0], s[2])
+            elif s[2] > s[0] and s[2] > s[1]:
+                direction = ti.Vector([axes[0, 2], axes[1, 2], axes[2, 2]])
+                largest, second = s[2], ti.max(s[0], s[1])
+            alignment = 0.0
+            for j in ti.static(range(k)):
+                offset = means[i] - neighbor_means[i, j]
+                alignment += ti.abs(direction.dot(offset)) / ti.sqrt(offset.dot(offset) + 1e-12)
+            loss[None] += (orient_weight * (1.0 - alignment / k) + shape_weight * second / largest) / count
+
+    return copy_neighbors, regularize

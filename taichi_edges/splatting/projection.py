@@ -1,0 +1,95 @@
+"""Projection of 3D Gaussians to 2D splats (EWA), differentiated by Taichi itself."""
+
+import numpy as np
+import taichi as ti
+
+SCREEN_BLUR = 0.3  # px^2 added to the 2D covariance; its loss of peak is compensated in the opacity
+ALPHA_MIN = 1.0 / 255.0  # a smaller contribution is not drawn
+ALPHA_MAX = 0.999
+BOX_SIGMAS = 3.0  # half size of a splat's box in standard deviations, cut earlier where alpha falls below ALPHA_MIN
+NEAR_PLANE = 0.05  # unit-cube units
+
+
+@ti.func
+def rotation(quaternion):
+    """(4,) w, x, y, z of any length -> 3x3 rotation matrix."""
+    unit = quaternion / ti.sqrt(quaternion.dot(quaternion) + 1e-20)
+    w, x, y, z = unit[0], unit[1], unit[2], unit[3]
+    return ti.Matrix(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+class CameraFields:
+    """All cameras of a scene on the device: world_to_camera (3, 4) and (fx, fy, cx, cy). No skew."""
+
+    def __init__(self, intrinsics, world_to_camera, real=ti.f32):
+        count = 1 << int(np.ceil(np.log2(max(len(intrinsics), 64))))  # a changed size recompiles the projection
+        dtype = np.float64 if real == ti.f64 else np.float32
+        self.world_to_camera = ti.Matrix.field(3, 4, real, shape=count)
+        self.pinhole = ti.Vector.field(4, real, shape=count)
+        poses = np.zeros((count, 3, 4), dtype)
+        poses[: len(world_to_camera)] = world_to_camera
+        pinholes = np.zeros((count, 4), dtype)
+        pinholes[: len(intrinsics)] = intrinsics[:, [0, 1, 0, 1], [0, 1, 2, 2]]
+        self.world_to_camera.from_numpy(poses)
+        self.pinhole.from_numpy(pinholes)
+
+
+class SplatFields:
+    """2D splats of one view: `splats` holds (u, v, conic a, b, c, opacity), `boxes` (u0, u1, v0, v1), ends exclusive.
+
+    alpha(p) = opacity * exp(-(a du^2 + c dv^2) / 2 - b du dv), d = p - (u, v) in pixels. An empty box is not drawn.
+    """
+
+    def __init__(self, capacity, real=ti.f32):
+        self.splats = ti.Vector.field(6, real, shape=capacity, needs_grad=True)
+        self.boxes = ti.Vector.field(4, ti.i32, shape=capacity)
+
+
+def make_project(gaussians, cameras, target):
+    """Kernel project(count, view, width, height): GaussianFields -> SplatFields; its `.grad` is Taichi's own."""
+    means, log_scales = gaussians.means, gaussians.log_scales
+    quaternions, opacity_logits = gaussians.quaternions, gaussians.opacity_logits
+    poses, pinholes = cameras.world_to_camera, cameras.pinhole
+    splats, boxes = target.splats, target.boxes
+
+    @ti.kernel
+    def project(count: ti.i32, view: ti.i32, width: ti.i32, height: ti.i32):
+        for i in range(count):
+            pose, pinhole = poses[view], pinholes[view]
+            camera_rotation = pose[:, :3]
+            point = camera_rotation @ means[i] + pose[:, 3]
+            inverse_depth = 1.0 / ti.max(point[2], NEAR_PLANE)
+            x, y = point[0] * inverse_depth, point[1] * inverse_depth
+            # Columns of M = J R_camera R S; the 2D covariance is M M^T. J: Jacobian of the pinhole at the mean.
+            axes = camera_rotation @ rotation(quaternions[i])
+            scales = ti.exp(log_scales[i])
+            jx, jy = pinhole[0] * inverse_depth, pinhole[1] * inverse_depth
+            row_u = ti.Vector([jx * (axes[0, j] - x * axes[2, j]) * scales[j] for j in ti.static(range(3))])
+            row_v = ti.Vector([jy * (axes[1, j] - y * axes[2, j]) * scales[j] for j in ti.static(range(3))])
+            uu, uv, vv = row_u.dot(row_u), row_u.dot(row_v), row_v.dot(row_v)
+            blurred_uu, blurred_vv = uu + SCREEN_BLUR, vv + SCREEN_BLUR
+            determinant = blurred_uu * blurred_vv - uv * uv
+            inverse = 1.0 / determinant
+            # The blur spreads the splat; its opacity falls so that the integral stays (Mip-Splatting, eq. 9).
+            compensation = ti.sqrt(ti.max((uu * vv - uv * uv) * inverse, 1e-8))
+            opacity = compensation / (1.0 + ti.exp(-opacity_logits[i]))
+            u, v = pinhole[0] * x + pinhole[2], pinhole[1] * y + pinhole[3]
+            splats[i] = ti.Vector([u, v, blurred_vv * inverse, -uv * inverse, blurred_uu * inverse, opacity])
+            # The box: no gradient passes through integers.
+            reach = ti.sqrt(ti.min(2.0 * ti.log(ti.max(opacity / ALPHA_MIN, 1.0)), BOX_SIGMAS * BOX_SIGMAS))
+            reach_u, reach_v = reach * ti.sqrt(blurred_uu), reach * ti.sqrt(blurred_vv)
+            u0 = ti.max(0, ti.cast(ti.ceil(u - reach_u), ti.i32))
+            u1 = ti.min(width, ti.cast(ti.floor(u + reach_u), ti.i32) + 1)
+            v0 = ti.max(0, ti.cast(ti.ceil(v - reach_v), ti.i32))
+            v1 = ti.min(height, ti.cast(ti.floor(v + reach_v), ti.i32) + 1)
+            if point[2] < NEAR_PLANE or opacity < ALPHA_MIN or u1 <= u0 or v1 <= v0:
+                u1, v1 = u0, v0
+            boxes[i] = ti.Vector([u0, u1, v0, v1])
+
+    return project

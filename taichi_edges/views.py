@@ -1,0 +1,107 @@
+"""Views: everything the later stages know about the input. Written by the prepare stage as `views.npz`."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from taichi_edges.artefacts import replacing
+from taichi_edges.cameras import Similarity, inside_image, project
+
+EDGE_THRESHOLD = 0.5  # of the map's full scale; from here on a pixel counts as an edge pixel
+
+
+@dataclass(frozen=True)
+class Views:
+    """Edge maps with their cameras, all of one image size.
+
+    names:            (V,) names of the views, unique.
+    edge_maps:        (V, H, W) uint8, 255 = certainly an edge.
+    intrinsics:       (V, 3, 3) float64 pixels, pixel centres at integers.
+    world_to_camera:  (V, 3, 4) float64, OpenCV axes, world = the unit cube.
+    image_paths:      (V,) path of the colour image of each view, '' where there is none.
+    similarity:       input frame -> unit cube.
+    box:              (2, 3) the scene box in the unit cube.
+    input_to_truth:   (4, 4) input frame -> frame of the ground truth (EMAP's `worldtogt`).
+    """
+
+    names: tuple
+    edge_maps: np.ndarray
+    intrinsics: np.ndarray
+    world_to_camera: np.ndarray
+    image_paths: tuple
+    similarity: Similarity = Similarity()
+    box: np.ndarray = field(default_factory=lambda: np.array([[0.0, 0, 0], [1, 1, 1]]))
+    input_to_truth: np.ndarray = field(default_factory=lambda: np.eye(4))
+
+    def __post_init__(self):
+        count, height, width = self.edge_maps.shape
+        assert self.edge_maps.dtype == np.uint8, self.edge_maps.dtype
+        assert len(self.names) == len(self.image_paths) == count and len(set(self.names)) == count
+        assert self.intrinsics.shape == (count, 3, 3) and self.world_to_camera.shape == (count, 3, 4)
+
+    def __len__(self):
+        return len(self.names)
+
+    @property
+    def height(self):
+        """Pixels."""
+        return self.edge_maps.shape[1]
+
+    @property
+    def width(self):
+        """Pixels."""
+        return self.edge_maps.shape[2]
+
+    def project(self, points, view):
+        """Pixels (n, 2), NaN behind the camera, and depths (n,) of (n, 3) unit-cube points in one view."""
+        return project(points, self.intrinsics[view], self.world_to_camera[view])
+
+    def edge_support(self, points, threshold=EDGE_THRESHOLD):
+        """How often points fall on edge pixels.
+
+        points: (n, 3) unit cube. threshold: of the map's full scale.
+        Returns (n,) number of views in which the point's pixel is an edge pixel, and (n,) number of views that have
+        the point in front of the camera (z > 0) and inside the image. Occlusion is not known here.
+        """
+        on_edge = np.zeros(len(points), np.int32)
+        seen = np.zeros(len(points), np.int32)
+        for view in range(len(self)):
+            pixels, _ = self.project(points, view)
+            inside = inside_image(pixels, self.width, self.height)
+            columns, rows = np.rint(pixels[inside]).astype(np.int64).T
+            seen += inside
+            on_edge[inside] += self.edge_maps[view, rows, columns] >= threshold * 255
+        return on_edge, seen
+
+
+def write_views(path, views):
+    """Write `views.npz` (compressed NumPy archive; the keys are the fields of `Views`)."""
+    with replacing(path) as unfinished, open(unfinished, "wb") as file:
+        np.savez_compressed(
+            file,
+            names=np.array(views.names),
+            edge_maps=views.edge_maps,
+            intrinsics=views.intrinsics,
+            world_to_camera=views.world_to_camera,
+            image_paths=np.array(views.image_paths),
+            similarity_scale=views.similarity.scale,
+            similarity_offset=np.array(views.similarity.offset),
+            box=views.box,
+            input_to_truth=views.input_to_truth,
+        )
+    return path
+
+
+def read_views(path):
+    """Read `views.npz`."""
+    with np.load(path) as archive:
+        return Views(
+            names=tuple(str(name) for name in archive["names"]),
+            edge_maps=archive["edge_maps"],
+            intrinsics=archive["intrinsics"],
+            world_to_camera=archive["world_to_camera"],
+            image_paths=tuple(str(path) for path in archive["image_paths"]),
+            similarity=Similarity(float(archive["similarity_scale"]), tuple(archive["similarity_offset"].tolist())),
+            box=archive["box"],
+            input_to_truth=archive["input_to_truth"],
+        )
