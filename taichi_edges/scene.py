@@ -57,7 +57,7 @@ class DensityConfig(Section):
     duplicate_epochs: list[int] = Field([*range(40, 161, 10), 210, 220, 350, 375], description="epochs")
     duplicate_gradient: Share = Field(0.5, description="relative positional gradient from which on to duplicate")
     duplicate_copies: Annotated[int, Field(ge=0)] = Field(2, description="copies of each")
-    duplicate_distance: NotNegative = Field(0.05, description="standard deviation of a copy's offset, unit-cube units")
+    duplicate_distance: NotNegative = Field(0.01, description="standard deviation of a copy's offset, unit-cube units")
     max_gaussians: Count = Field(50_000, description="no duplication beyond this number")
     cull_opacity_epochs: list[int] = Field([125, 310, 450], description="epochs")
     min_opacity: Share = Field(0.05, description="Gaussians below are culled")
@@ -95,8 +95,8 @@ class FilterConfig(Section):
 
     min_opacity: Share = Field(0.2)
     min_support: Share = Field(0.15, description="share of the views that see a point and have an edge pixel there")
-    outlier_neighbors: Annotated[int, Field(ge=0)] = Field(25, description="statistical outliers: neighbours; 0: off")
-    outlier_deviations: Positive = Field(2.0, description="mean neighbour distance allowed, standard deviations")
+    outlier_neighbors: Annotated[int, Field(ge=0)] = Field(10, description="statistical outliers: neighbours; 0: off")
+    outlier_deviations: Positive = Field(5.0, description="mean neighbour distance allowed, standard deviations")
 
 
 class ClusterConfig(Section):

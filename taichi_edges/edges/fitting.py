@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.interpolate import BSpline, make_lsq_spline
+from scipy.interpolate import BSpline
 from scipy.spatial import cKDTree
 
 from taichi_edges.edges.bezier import evaluate_bezier
@@ -14,6 +14,7 @@ ROBUST_ROUNDS = 10
 REPARAMETRIZATIONS = 4
 TURN_PER_CUBIC = np.radians(100.0)  # one cubic follows a circular arc of 90 degrees to 3e-4 of the radius
 END_QUANTILE = 0.01  # of the points along a line: its ends, so that one stray point does not lengthen it
+BENDING = 1e-3  # penalty on second differences of the control points, relative to the data
 CURVE_SAMPLES = 128  # for each cubic, where distances to a curve are measured
 
 
@@ -139,17 +140,14 @@ def _hermite_to_bezier(values, derivatives, spans):
 
 
 def _lsq_spline(parameters, points, weights, knots):
-    """make_lsq_spline, or a ridge-regularised fit where a knot span has too few points for it."""
+    """Weighted least-squares cubic spline; a faint penalty on bending carries it over knot spans without points."""
     clamped = np.concatenate([[knots[0]] * 3, knots, [knots[-1]] * 3])
     inside = np.clip(parameters, knots[0], knots[-1])
-    try:
-        return make_lsq_spline(inside, points, clamped, k=3, w=np.sqrt(weights))
-    except (ValueError, np.linalg.LinAlgError):
-        design = BSpline.design_matrix(inside, clamped, 3).toarray() * np.sqrt(weights)[:, None]
-        bend = np.diff(np.eye(design.shape[1]), 2, axis=0) * 1e-3 * np.sqrt(weights.sum())
-        targets = np.concatenate([points * np.sqrt(weights)[:, None], np.zeros((len(bend), 3))])
-        solution = np.linalg.lstsq(np.concatenate([design, bend]), targets, rcond=None)[0]
-        return BSpline(clamped, solution, 3)
+    design = BSpline.design_matrix(inside, clamped, 3).toarray() * np.sqrt(weights)[:, None]
+    bend = np.diff(np.eye(design.shape[1]), 2, axis=0) * BENDING * np.sqrt(weights.sum())
+    targets = np.concatenate([points * np.sqrt(weights)[:, None], np.zeros((len(bend), 3))])
+    coefficients = np.linalg.lstsq(np.concatenate([design, bend]), targets, rcond=None)[0]
+    return BSpline(clamped, coefficients, 3)
 
 
 def nearest_on_chain(points, curves):

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 GRAPH_NEIGHBORS = 8
 REACH = 3.0  # graph edges longer than this many times the longest gap of the spanning tree are shortcuts
 WAIST = (0.4, 0.6)  # of the longest walk: an open edge is one strip here, a closed one two
+SPAN = 0.6  # of the waist that a strip reaches through at least
 
 
 @dataclass(frozen=True)
@@ -27,11 +28,10 @@ def order_points(points):
     start = int(np.argmax(dijkstra(graph, indices=0)))
     from_start = dijkstra(graph, indices=start)
     length = float(from_start.max())
-    waist = np.flatnonzero((from_start >= WAIST[0] * length) & (from_start <= WAIST[1] * length))
-    sides = _two_sides(points, waist)
-    if sides is None:
+    strips = _two_sides(graph, from_start, length)
+    if strips is None:
         return Ordering(from_start, length, False)
-    return _unroll(graph, from_start, length, sides)
+    return _unroll(graph, from_start, length, strips)
 
 
 def _connected_graph(points):
@@ -69,29 +69,23 @@ def _bridge(points, graph, labels):
     return graph.tocsr()
 
 
-def _two_sides(points, waist):
-    """Labels 0/1 of the waist's points when it consists of two separate strips, else None."""
-    if len(waist) < 4:
-        return None
-    strip = points[waist]
-    spread = np.linalg.norm(strip - strip.mean(axis=0), axis=1).max()
-    tree = cKDTree(strip)
-    gap = 0.5 * spread
-    pairs = tree.query_pairs(gap, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(strip),) * 2)
-    pieces, labels = connected_components(graph, directed=False)
-    sizes = np.bincount(labels)
-    if pieces < 2 or np.sort(sizes)[-2] < 2:
-        return None
-    largest = np.argsort(-sizes, kind="stable")[:2]
-    return {int(waist[i]): int(labels[i] == largest[1]) for i in range(len(strip)) if labels[i] in largest}
+def _two_sides(graph, from_start, length):
+    """The two strips (arrays of indices) of which a closed edge consists at its waist; None for an open edge.
+
+    Each strip must reach through the whole waist: a mere gap in an open edge leaves pieces that share it out.
+    """
+    waist = np.flatnonzero((from_start >= WAIST[0] * length) & (from_start <= WAIST[1] * length))
+    pieces, labels = connected_components(graph[waist][:, waist], directed=False)
+    strips = [waist[labels == piece] for piece in range(pieces)]
+    least = SPAN * (WAIST[1] - WAIST[0]) * length
+    strips = [strip for strip in strips if np.ptp(from_start[strip]) >= least]
+    return strips if len(strips) == 2 else None
 
 
-def _unroll(graph, from_start, length, sides):
+def _unroll(graph, from_start, length, strips):
     """Arc length around a closed edge: out on one side (0 .. L), back on the other (L .. 2 L)."""
-    members = [np.array([p for p, side in sides.items() if side == s]) for s in (0, 1)]
     # Which arm a point is on: the side whose waist it reaches without passing start or far end, that is, the nearer.
-    nearest = [dijkstra(graph, indices=m, min_only=True) for m in members]
+    nearest = [dijkstra(graph, indices=strip, min_only=True) for strip in strips]
     back = nearest[1] < nearest[0]
     arc = np.where(back, 2 * length - from_start, from_start)
     return Ordering(arc, 2 * length, True)

@@ -62,7 +62,7 @@ def in_gap(starts, ends, strokes, imperfections, generator):
     """(s,) bool: which of the (s, 2) consecutive segments fall into a randomly placed gap of their stroke."""
     lengths, middles = np.linalg.norm(ends - starts, axis=1), (starts + ends) / 2.0
     missing = np.zeros(len(starts), bool)
-    # The last gap may go beyond the fraction asked for; a start up to one gap earlier makes the fraction right on average.
+    # The last gap goes beyond what is asked for; asking for up to one gap less makes it right on average.
     wanted = imperfections.gap_fraction * lengths.sum() - generator.uniform() * imperfections.gap_length_px
     while lengths[missing].sum() < wanted:
         middle = generator.choice(len(starts), p=lengths / lengths.sum())

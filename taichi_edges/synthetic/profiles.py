@@ -11,7 +11,7 @@ import numpy as np
 from taichi_edges.edges.bezier import evaluate_bezier
 
 ARC_PIECE = 45.0  # degrees: a cubic of 45 degrees leaves the true circle by 4.2e-6 of the radius
-PIECE_FACETS = 24  # mesh facets across one arc piece; the same for all radii, so that concentric surfaces share vertices
+PIECE_FACETS = 24  # mesh facets across an arc piece; equal for all radii, so that faces about one axis can meet
 CHORD_ERROR = 5e-5  # world units: the mesh stays this near to a free-form curve
 SHARP_ANGLE = 8.0  # degrees: a smaller break of the tangent counts as smooth; facets of one curve turn by less
 

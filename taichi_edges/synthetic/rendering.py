@@ -14,15 +14,16 @@ ELEVATIONS = (22.0, 52.0, -32.0)  # degrees above the horizon, one ring each; fr
 FIELD_OF_VIEW = 40.0  # degrees
 FIRST_AZIMUTH = 17.0  # degrees: no camera looks straight along a side of the cube
 CUBE_CENTRE = np.full(3, 0.5)
-CUBE_CORNERS = np.array(list(np.ndindex(2, 2, 2)), dtype=np.float64)
+CUBE_RADIUS = np.sqrt(3.0) / 2.0  # of the sphere about the unit cube, which just fits into every view
 SAMPLE_PX = 0.4  # spacing of the samples along an edge, in pixels at the centre of the cube
 
 # Directions towards three lamps and their colours: no two faces of a part come out alike, so that a detector which
 # reads the pictures finds every edge.
 LAMPS = np.array([[0.35, -0.55, 0.76], [-0.85, 0.15, 0.50], [0.30, 0.55, -0.65]])
 LAMPS /= np.linalg.norm(LAMPS, axis=1, keepdims=True)
-LAMP_COLOURS = np.array([[0.50, 0.55, 0.56], [0.18, 0.28, 0.40], [0.26, 0.24, 0.30]])
+LAMP_COLOURS = np.array([[0.44, 0.50, 0.53], [0.18, 0.26, 0.36], [0.26, 0.24, 0.30]])
 AMBIENT = np.array([0.07, 0.09, 0.12])
+GLOOM = 0.4  # how much darker the floor of the cube is than its middle; sets parallel faces at different heights apart
 SUPERSAMPLING = 2  # rays along each side of a pixel of the pictures
 
 
@@ -41,11 +42,8 @@ def ring_cameras(view_count, image_size, elevations=ELEVATIONS, field_of_view=FI
     outward = np.stack(
         [np.cos(heights) * np.cos(azimuths), np.cos(heights) * np.sin(azimuths), np.sin(heights)], axis=1
     )
-    poses = np.stack([look_at(CUBE_CENTRE + direction, CUBE_CENTRE) for direction in outward])
-    # A corner at (x, y, z) from the cube's centre, in camera axes, is in view from the distance |x| / tan(half) - z on.
-    corners = (CUBE_CORNERS - CUBE_CENTRE) @ poses[:, :, :3].transpose(0, 2, 1)
-    distance = (np.abs(corners[..., :2]).max(axis=-1) / np.tan(half) - corners[..., 2]).max()
-    poses[:, 2, 3] += distance - 1.0
+    centres = CUBE_CENTRE + CUBE_RADIUS / np.sin(half) * outward
+    poses = np.stack([look_at(centre, CUBE_CENTRE) for centre in centres])
     return np.repeat(intrinsics[None], view_count, axis=0), poses
 
 
@@ -108,17 +106,19 @@ def render_pictures(part, intrinsics, world_to_camera, image_size):
 def render_picture(part, scene, lens, pose, image_size):
     """(H, W, 3) uint8 RGB: one shaded picture on white."""
     fine = image_size * SUPERSAMPLING
-    steps = (np.arange(fine) + 0.5) / SUPERSAMPLING - 0.5  # pixel centres at integers
+    steps = (np.arange(fine, dtype=np.float32) + 0.5) / SUPERSAMPLING - 0.5  # pixel centres at integers
     columns, rows = np.meshgrid(steps, steps)
     on_sensor = np.stack([columns, rows, np.ones_like(columns)], axis=-1).reshape(-1, 3)
-    directions = on_sensor @ (pose[:, :3].T @ np.linalg.inv(lens)).T
+    directions = on_sensor @ (pose[:, :3].T @ np.linalg.inv(lens)).T.astype(np.float32)
     rays = np.empty((len(directions), 6), np.float32)
     rays[:, :3], rays[:, 3:] = camera_centre(pose), directions
     hits = scene.cast_rays(rays)
-    hit = np.isfinite(hits["t_hit"].numpy())
+    depths = hits["t_hit"].numpy()
+    hit = np.isfinite(depths)
+    heights = rays[hit, 2] + depths[hit] * rays[hit, 5]
     colours = np.ones((fine * fine, 3), np.float32)
     normals = interpolated_normals(part, hits["primitive_ids"].numpy()[hit], hits["primitive_uvs"].numpy()[hit])
-    colours[hit] = shade(normals)
+    colours[hit] = shade(normals, heights)
     picture = cv2.resize(colours.reshape(fine, fine, 3), (image_size, image_size), interpolation=cv2.INTER_AREA)
     return np.rint(255.0 * picture).astype(np.uint8)
 
@@ -130,7 +130,11 @@ def interpolated_normals(part, triangles, barycentric):
     return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
-def shade(normals):
-    """(n, 3) unit normals -> (n, 3) RGB in 0..1. Soft lamps: the light wraps half-way round the back of the part."""
+def shade(normals, heights):
+    """(n, 3) unit normals and (n,) heights in the cube -> (n, 3) RGB in 0..1.
+
+    The lamps are soft: their light wraps half-way round the back of the part.
+    """
     wrapped = (0.5 + 0.5 * normals @ LAMPS.T) ** 2
-    return np.clip(AMBIENT + wrapped @ LAMP_COLOURS, 0.0, 1.0)
+    dimmed = 1.0 + 2.0 * GLOOM * (heights[:, None] - 0.5)
+    return np.clip((AMBIENT + wrapped @ LAMP_COLOURS) * dimmed, 0.0, 1.0)

@@ -76,7 +76,7 @@ class Part:
 
 
 def corner_angles(corners):
-    """(m, 3, 3) triangle corners -> (m, 3) inner angles: the weights that make vertex normals independent of the mesh."""
+    """(m, 3, 3) corners -> (m, 3) inner angles: weights that make vertex normals independent of the triangulation."""
     onward = np.roll(corners, -1, axis=1) - corners
     back = np.roll(corners, 1, axis=1) - corners
     return np.arctan2(np.linalg.norm(np.cross(onward, back), axis=2), (onward * back).sum(axis=2))
@@ -128,7 +128,7 @@ def assemble(name, surfaces):
         return (points - (low + high) / 2.0) * scale + 0.5
 
     part = Part(name, into_cube(vertices), indices.reshape(-1, 3), distinct_edges(surfaces).transformed(into_cube))
-    part.mesh_edges  # refuses faces that do not close
+    _ = part.mesh_edges  # refuses faces that do not close
     return part
 
 

@@ -1,0 +1,94 @@
+"""What `run.py` does with its options: load the scene, run the corridor, print the summary, show the window."""
+
+import os
+from pathlib import Path
+
+from taichi_edges.errors import UserError
+from taichi_edges.pipeline import STAGES, Run, run_stages
+from taichi_edges.progress import make_progress
+from taichi_edges.scene import load_scene
+
+
+def run_command(options):
+    """Run what the parsed command line `options` asks for; mistakes of the user raise UserError."""
+    config = load_scene(options.scene, options.preset, options.set, options.seed)
+    data = options.data or os.environ.get("TAICHI_EDGES_DATA")
+    if data and not Path(data).expanduser().is_dir():
+        origin = "--data" if options.data else "TAICHI_EDGES_DATA"
+        raise UserError(f"{origin}: {data} is not a folder; name the folder that holds the scenes' data")
+    run = Run(
+        config=config,
+        folder=Path(options.out) / config.name,
+        data_root=Path(data).expanduser().resolve() if data else None,
+        threads=_threads(options.threads),
+        arch=options.arch,
+        progress=make_progress(options.quiet),
+    )
+    record = run_stages(run, options.stage, options.until)
+    print_summary(run, record, options.until)
+    if options.show:
+        show(run)
+
+
+def _threads(wanted):
+    """Threads to use: what the user wants, or all that this process may use."""
+    if wanted is None:
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if wanted < 1:
+        raise UserError(f"--threads {wanted}: must be at least 1")
+    return wanted
+
+
+def print_summary(run, record, until=None):
+    """The metrics and the time of every stage, as two tables (plain lines where the output is not a terminal)."""
+    names = list(STAGES)
+    done = [name for name in names[: names.index(until) + 1 if until else None] if name in record["stages"]]
+    rows = []
+    for name in done:
+        stage = record["stages"][name]
+        seconds = f"{stage['seconds']:.1f} s" + (" (earlier)" if stage.get("skipped") else "")
+        rows.append((name, seconds, f"{stage['peak_memory_mib']:.0f} MiB"))
+    if "evaluate" in done:
+        from taichi_edges.evaluation.metrics import metrics_rows
+
+        metrics = record["stages"]["evaluate"]["facts"]
+        if metrics["ground_truth"] is None:
+            found = [("lines", str(metrics["lines"])), ("curves", str(metrics["curves"])), ("ground truth", "none")]
+        else:
+            found = metrics_rows(metrics)
+        _print_table(f"{run.config.name}: metrics", ("metric", "value"), found)
+    _print_table(f"{run.config.name}: stages", ("stage", "time", "peak memory"), rows)
+    print(f"results: {run.folder}/" + ("  (edges.json, edges.ply, edges.obj, overlays.png)" if "export" in done else ""))
+
+
+def _print_table(title, headings, rows):
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        print(title)
+        widths = [max(len(row[column]) for row in rows) for column in range(len(headings))] if rows else []
+        for row in rows:
+            print("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        return
+    table = Table(title=title, title_justify="left")
+    for column, heading in enumerate(headings):
+        table.add_column(heading, justify="right" if column else "left")
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)
+
+
+def show(run):
+    """An Open3D window of the oriented points and the edges."""
+    from taichi_edges.edges.edge_set import read_edges
+    from taichi_edges.exporters.point_cloud import read_oriented_points
+    from taichi_edges.exporters.viewer import show as show_window
+
+    for artefact in ("points.ply", "edges.json"):
+        if not run.path(artefact).exists():
+            raise UserError(f"{run.path(artefact)}: not there yet; --show needs the fit stage, run without --until")
+    points, directions = read_oriented_points(run.path("points.ply"))
+    files = [str(run.path(name)) for name in ("points.ply", "edges.ply", "edges.obj", "overlays.png")]
+    show_window(points, directions, read_edges(run.path("edges.json"))[0], files)

@@ -1,0 +1,51 @@
+"""The layout of EMAP's ABC-NEF_Edge: `meta_data.json`, `camtoworld` with OpenCV axes, one folder for each detector."""
+
+import numpy as np
+
+from taichi_edges.errors import UserError
+from taichi_edges.readers.frames import Frames, matrix, read_json
+
+
+def read_emap(folder, config):
+    """Frames of an EMAP folder. config: the scene's `source` section."""
+    where = folder / "meta_data.json"
+    content = read_json(where, "an EMAP folder holds meta_data.json")
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise UserError(f"{where}: has no 'frames'; is this EMAP's meta_data.json?")
+    if not config.edges:
+        raise UserError(f"{where}: source.edges is missing: the folder of the edge maps, e.g. edge_DexiNed")
+    names = [_name(frame, where) for frame in frames]
+    return Frames(
+        where=where,
+        names=[name.rsplit(".", 1)[0] for name in names],
+        edge_paths=[folder / config.edges / name for name in names],
+        image_paths=[folder / config.images / name if config.images else "" for name in names],
+        intrinsics=[_intrinsics(frame, name, where) for frame, name in zip(frames, names, strict=True)],
+        camera_to_world=[frame.get("camtoworld") for frame in frames],
+        opengl=False,
+        size=_size(content, where),
+        input_to_truth=matrix(content.get("worldtogt", np.eye(4)), (4, 4), where, "worldtogt"),
+    )
+
+
+def _name(frame, where):
+    if not isinstance(frame, dict) or not isinstance(frame.get("rgb_path"), str):
+        raise UserError(f"{where}: a frame without rgb_path; every frame names its image")
+    return frame["rgb_path"]
+
+
+def _intrinsics(frame, name, where):
+    """The 3x3 part of EMAP's 3x3 or 4x4 intrinsics."""
+    values = np.asarray(frame.get("intrinsics"), dtype=object)
+    rows = 4 if values.shape == (4, 4) else 3
+    return matrix(frame.get("intrinsics"), (rows, rows), where, f"intrinsics of {name}")[:3, :3]
+
+
+def _size(content, where):
+    if "width" not in content and "height" not in content:
+        return None
+    try:
+        return int(content["width"]), int(content["height"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{where}: width and height must both be whole numbers of pixels") from error

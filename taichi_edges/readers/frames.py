@@ -1,0 +1,242 @@
+"""Frames: what a reader found on disk, before anything is decoded; and how frames become Views, with every check."""
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from taichi_edges.cameras import OPENGL_TO_OPENCV, Similarity, inside_image, invert_pose, project
+from taichi_edges.errors import UserError, did_you_mean, name_some
+from taichi_edges.views import Views
+
+ORTHONORMAL_TOLERANCE = 1e-3  # largest deviation of R^T R from the identity; files store six digits or more
+BOX_GRID = 9  # points along each side of the scene box that are looked for in every view
+LEAVE_OUT = "or leave such views out with source.skip"
+# What a whole file ends with; a decoder alone may fill the missing rows of a truncated file with grey.
+END_MARKERS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Views as a layout describes them.
+
+    where: the file that lists them, for messages. names: (V,). edge_paths, image_paths: (V,) paths, an image may be
+    missing. intrinsics: (V, 3, 3), pixel centres at integers, or a function (width, height) -> (3, 3) where they
+    depend on the image size. camera_to_world: (V, 4, 4) as in the file. opengl: are those OpenGL axes?
+    size: (width, height) if the file says so. input_to_truth: (4, 4).
+    """
+
+    where: Path
+    names: list
+    edge_paths: list
+    image_paths: list
+    intrinsics: list
+    camera_to_world: list
+    opengl: bool
+    size: tuple | None = None
+    input_to_truth: np.ndarray = field(default_factory=lambda: np.eye(4))
+
+
+def read_json(path, what):
+    """A JSON file as Python; `what` names it in the message when it is missing or broken."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: not found; {what}; check source.path and source.reader") from error
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise UserError(f"{path}: cannot be read as JSON ({error}); download or export it again") from error
+
+
+def matrix(values, shape, where, key):
+    """A numeric array of the given shape from JSON values."""
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{where}: {key} is not a matrix of numbers") from error
+    if array.shape != shape:
+        raise UserError(f"{where}: {key} must be a {' x '.join(map(str, shape))} matrix, but its shape is {array.shape}")
+    return array
+
+
+def build_views(frames, config, box, progress):
+    """Check the frames, decode the edge maps and bring the scene box into the unit cube.
+
+    config: the scene's `source` section. box: (2, 3) corners, input units.
+    """
+    frames = _without_skipped(frames, config.skip)
+    _check_names(frames)
+    poses = np.stack([matrix(pose, (4, 4), frames.where, f"the pose of {name}") for name, pose in _each(frames)])
+    _check_poses(frames, poses)
+    opengl = frames.opengl if config.axes == "auto" else config.axes == "opengl"
+    poses = poses @ OPENGL_TO_OPENCV if opengl else poses
+    edge_maps = _read_edge_maps(frames, progress)
+    height, width = edge_maps.shape[1:]
+    intrinsics = np.stack([k(width, height) if callable(k) else k for k in frames.intrinsics])
+    _check_intrinsics(frames, intrinsics, width, height)
+    world_to_camera = invert_pose(poses)
+    _check_box_seen(frames, intrinsics, world_to_camera, np.asarray(box, dtype=np.float64), (width, height), opengl)
+    similarity = Similarity.of_box(box)
+    return Views(
+        names=tuple(frames.names),
+        edge_maps=edge_maps,
+        intrinsics=intrinsics,
+        world_to_camera=into_unit_cube(world_to_camera, similarity),
+        image_paths=tuple(_usable_images(frames, progress)),
+        similarity=similarity,
+        box=similarity.to_unit(np.asarray(box, dtype=np.float64)),
+        input_to_truth=frames.input_to_truth,
+    )
+
+
+def into_unit_cube(world_to_camera, similarity):
+    """The same cameras for a world that went through the similarity: camera units become unit-cube units too."""
+    moved = world_to_camera.copy()
+    rotations, translations = world_to_camera[:, :, :3], world_to_camera[:, :, 3]
+    moved[:, :, 3] = similarity.scale * translations - rotations @ np.asarray(similarity.offset)
+    return moved
+
+
+def _each(frames):
+    return zip(frames.names, frames.camera_to_world, strict=True)
+
+
+def _without_skipped(frames, skip):
+    for name in skip:
+        if name not in frames.names:
+            raise UserError(f"source.skip: {frames.where} has no view '{name}'{did_you_mean(name, frames.names)}")
+    keep = [i for i, name in enumerate(frames.names) if name not in skip]
+    if not keep:
+        raise UserError(f"{frames.where}: no view is left; it lists {len(frames.names)}, source.skip leaves out {len(skip)}")
+    lists = ("names", "edge_paths", "image_paths", "intrinsics", "camera_to_world")
+    chosen = {key: [getattr(frames, key)[i] for i in keep] for key in lists}
+    return Frames(
+        frames.where, *chosen.values(), opengl=frames.opengl, size=frames.size, input_to_truth=frames.input_to_truth
+    )
+
+
+def _check_names(frames):
+    twice = {name for name in frames.names if frames.names.count(name) > 1}
+    if twice:
+        raise UserError(f"{frames.where}: listed more than once: {name_some(sorted(twice))}; every view needs a name of its own")
+
+
+def _check_poses(frames, poses):
+    """Finite, orthonormal, right-handed, and the last row 0 0 0 1."""
+    finite = np.isfinite(poses).all(axis=(1, 2))
+    _refuse(frames, ~finite, f"the pose is not finite; export the poses again, {LEAVE_OUT}")
+    rotations = poses[:, :3, :3]
+    gram = np.swapaxes(rotations, 1, 2) @ rotations
+    crooked = np.abs(gram - np.eye(3)).max(axis=(1, 2)) > ORTHONORMAL_TOLERANCE
+    hint = "divide a scale out of the rotation" if np.allclose(gram[0] / gram[0, 0, 0], np.eye(3), atol=1e-3) else "export the poses again"
+    _refuse(frames, crooked, f"the rotation of the pose is not orthonormal; {hint}, {LEAVE_OUT}")
+    _refuse(frames, np.linalg.det(rotations) < 0, f"the rotation of the pose is a mirror (determinant -1); {LEAVE_OUT}")
+    last = np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1) > ORTHONORMAL_TOLERANCE
+    _refuse(frames, last, f"the last row of the pose is not 0 0 0 1; is the matrix transposed? {LEAVE_OUT}")
+
+
+def _refuse(frames, bad, problem):
+    """UserError that names the views marked in the (V,) bool array `bad`."""
+    if bad.any():
+        names = [name for name, is_bad in zip(frames.names, bad, strict=True) if is_bad]
+        raise UserError(f"{frames.where}: {len(names)} of {len(bad)} views ({name_some(names)}): {problem}")
+
+
+def _check_intrinsics(frames, intrinsics, width, height):
+    focal = intrinsics[:, [0, 1], [0, 1]]
+    bad = ~np.isfinite(intrinsics).all(axis=(1, 2)) | (focal <= 0).any(axis=1)
+    _refuse(frames, bad, f"the focal length is not a positive number; correct the intrinsics, {LEAVE_OUT}")
+    skewed = np.abs(intrinsics[:, 0, 1]) > 1e-6 * focal[:, 0]
+    _refuse(frames, skewed, "the intrinsics have skew, which is not supported; rectify the images")
+    outside = (intrinsics[:, :2, 2] < 0).any(axis=1) | (intrinsics[:, :2, 2] > [width, height]).any(axis=1)
+    problem = f"the principal point is outside the {width}x{height} image; were the images resized after calibration? {LEAVE_OUT}"
+    _refuse(frames, outside, problem)
+
+
+def _read_edge_maps(frames, progress):
+    """(V, H, W) uint8, decoded in parallel; missing, damaged and wrongly sized maps are named."""
+    paths = [Path(path) for path in frames.edge_paths]
+    missing = np.array([not path.is_file() for path in paths])
+    if missing.all():
+        raise UserError(f"{paths[0].parent}: no edge map found here; check source.edges ({frames.where.parent} has: {_folders(frames)})")
+    _refuse(frames, missing, f"the edge map is missing ({paths[int(missing.argmax())]}); run the detector on it, {LEAVE_OUT}")
+    with ThreadPoolExecutor() as pool:
+        maps = list(pool.map(read_grey, paths))
+    broken = np.array([edge_map is None for edge_map in maps])
+    _refuse(frames, broken, f"the edge map is truncated or not an image ({paths[int(broken.argmax())]}); write it again, {LEAVE_OUT}")
+    sizes = [(edge_map.shape[1], edge_map.shape[0]) for edge_map in maps]
+    size = frames.size or max(set(sizes), key=sizes.count)
+    wrong = np.array([s != size for s in sizes])
+    if wrong.any():
+        width, height = sizes[int(wrong.argmax())]
+        expected = f"{frames.where.name} says" if frames.size else "most are"
+        problem = f"the edge map is {width}x{height}, but {expected} {size[0]}x{size[1]}; write it in that size, {LEAVE_OUT}"
+        _refuse(frames, wrong, problem)
+    maps = np.stack(maps)
+    empty = ~(maps >= 128).any(axis=(1, 2))
+    if empty.all():
+        raise UserError(f"{paths[0].parent}: no edge map has an edge pixel (a value of 128 or more); are these the detector's outputs?")
+    if empty.any():
+        names = [name for name, is_empty in zip(frames.names, empty, strict=True) if is_empty]
+        progress.warn(f"{len(names)} of {len(maps)} edge maps have no edge pixel and teach nothing: {name_some(names)}")
+    return maps
+
+
+def _folders(frames):
+    folders = sorted(p.name for p in frames.where.parent.iterdir() if p.is_dir())
+    return name_some(folders, 8) or "no folders"
+
+
+def is_whole(path):
+    """Does the file end as a whole file of its kind ends? Formats without a known end marker pass."""
+    marker = END_MARKERS.get(path.suffix.lower())
+    with open(path, "rb") as file:
+        content = file.read()
+    return bool(content) and (marker is None or marker in content[-64:])
+
+
+def read_grey(path):
+    """(H, W) uint8 of an image file: one channel, or the brightest of three; None where it is damaged.
+
+    16-bit maps are brought to 8 bits.
+    """
+    if not is_whole(path):
+        return None
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        return None
+    if image.dtype == np.uint16:
+        image = (image // 257).astype(np.uint8)
+    if image.dtype != np.uint8:
+        return None
+    return image if image.ndim == 2 else np.ascontiguousarray(image[:, :, :3].max(axis=2))
+
+
+def _usable_images(frames, progress):
+    """Paths of the colour images that are there and whole, '' for the others (named in a warning)."""
+    wanted = [Path(path) if path else None for path in frames.image_paths]
+    usable = [path is not None and path.is_file() and is_whole(path) for path in wanted]
+    lost = [name for name, path, ok in zip(frames.names, wanted, usable, strict=True) if path is not None and not ok]
+    if lost:
+        problem = "is missing or truncated; their overlays show the edge map instead"
+        progress.warn(f"{len(lost)} of {len(wanted)} views: the colour image {problem}: {name_some(lost)}")
+    return [str(path) if ok else "" for path, ok in zip(wanted, usable, strict=True)]
+
+
+def _check_box_seen(frames, intrinsics, world_to_camera, box, size, opengl):
+    """Every view must have some of the scene box in front of it and inside the image."""
+    axes = [np.linspace(low, high, BOX_GRID) for low, high in zip(*box, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    blind = np.array(
+        [not inside_image(project(grid, k, pose)[0], *size).any() for k, pose in zip(intrinsics, world_to_camera, strict=True)]
+    )
+    corners = " to ".join("(" + ", ".join(f"{x:g}" for x in corner) + ")" for corner in box)
+    if blind.all():
+        used, other = ("OpenGL", "opencv") if opengl else ("OpenCV", "opengl")
+        raise UserError(
+            f"{frames.where}: 0 of {len(blind)} views see the scene box {corners}: read with {used} axes; "
+            f"set source.axes: {other}, or correct the box"
+        )
+    _refuse(frames, blind, f"they do not see the scene box {corners}; correct the box, {LEAVE_OUT}")

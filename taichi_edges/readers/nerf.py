@@ -1,0 +1,53 @@
+"""The layout of NEF, which is NeRF's "Blender" layout: `transforms_<split>.json`, OpenGL axes, images named in it.
+
+Intrinsics are per frame (`camera_intrinsics`, 3x3, pixel centres at integers) or follow from `camera_angle_x`, the
+horizontal field of view in radians; then the principal point is the image's centre, (size - 1) / 2.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from taichi_edges.errors import UserError
+from taichi_edges.readers.frames import Frames, matrix, read_json
+
+
+def read_nerf(folder, config):
+    """Frames of a NEF folder. config: the scene's `source` section."""
+    where = folder / f"transforms_{config.split}.json"
+    content = read_json(where, "a NEF folder holds transforms_<split>.json")
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise UserError(f"{where}: has no 'frames'; is this a transforms file of NEF or NeRF (Blender)?")
+    paths = [_file_path(frame, where) for frame in frames]
+    return Frames(
+        where=where,
+        names=[path.stem for path in paths],
+        edge_paths=[folder / (config.edges or path.parent) / path.name for path in paths],
+        image_paths=[folder / config.images / path.name if config.images else "" for path in paths],
+        intrinsics=[_intrinsics(frame, content, path.stem, where) for frame, path in zip(frames, paths, strict=True)],
+        camera_to_world=[frame.get("transform_matrix") for frame in frames],
+        opengl=True,
+    )
+
+
+def _file_path(frame, where):
+    """Relative path of the frame's image; the layout leaves the suffix out."""
+    if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+        raise UserError(f"{where}: a frame without file_path; every frame names its image")
+    path = Path(frame["file_path"])
+    return path if path.suffix.lower() in (".png", ".jpg", ".jpeg") else path.with_name(path.name + ".png")
+
+
+def _intrinsics(frame, content, name, where):
+    if "camera_intrinsics" in frame:
+        return matrix(frame["camera_intrinsics"], (3, 3), where, f"camera_intrinsics of {name}")
+    angle = frame.get("camera_angle_x", content.get("camera_angle_x"))
+    if not isinstance(angle, (int, float)) or not 0 < angle < np.pi:
+        raise UserError(f"{where}: {name} has neither camera_intrinsics nor a camera_angle_x between 0 and pi radians")
+
+    def from_angle(width, height):
+        focal = 0.5 * width / np.tan(0.5 * angle)
+        return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+
+    return from_angle

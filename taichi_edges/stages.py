@@ -1,0 +1,209 @@
+"""The stages: each reads the artefacts of those before it from the run's folder and writes its own.
+
+A stage is a plain function of a Run that returns the facts it found (JSON-able), which `run.json` keeps. It reads only
+what is on disk, so a resumed run cannot differ from an unbroken one.
+"""
+
+import csv
+import io
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from taichi_edges.artefacts import replacing, write_json, write_text
+from taichi_edges.edges.clustering import grow_clusters
+from taichi_edges.edges.edge_set import read_edges, write_edges
+from taichi_edges.edges.filtering import filter_points
+from taichi_edges.edges.fitting import fit_clusters
+from taichi_edges.errors import UserError
+from taichi_edges.views import read_views, write_views
+
+
+def prepare(run):
+    """Source -> `views.npz`, and for synthetic scenes the exact edges as `truth.json` and pictures in `images/`."""
+    source = run.config.source
+    if source.reader == "synthetic":
+        return _prepare_synthetic(run)
+    from taichi_edges.readers import READERS
+    from taichi_edges.readers.frames import build_views
+
+    folder = run.data_path(source.path, "source.path")
+    views = build_views(READERS[source.reader](folder, source), source, run.config.box, run.progress)
+    write_views(run.path("views.npz"), views)
+    return {"views": len(views), "width_px": views.width, "height_px": views.height}
+
+
+def _prepare_synthetic(run):
+    """Render the embedded part; every random choice follows the scene's seed."""
+    import cv2
+
+    from taichi_edges.synthetic.drawing import Imperfections
+    from taichi_edges.synthetic.parts import PARTS
+    from taichi_edges.synthetic.rendering import render_views
+
+    source = run.config.source
+    part = PARTS[source.part]()
+    generator = np.random.default_rng(run.config.seed)
+    views, pictures = render_views(part, source.views, source.size, Imperfections(), generator)
+    paths = [run.path("images") / f"{name}.png" for name in views.names]
+    for path, picture in zip(paths, pictures, strict=True):
+        with replacing(path) as unfinished:
+            cv2.imwrite(str(unfinished), picture[:, :, ::-1])
+    views = type(views)(**{**vars(views), "image_paths": tuple(str(path) for path in paths)})
+    write_edges(run.path("truth.json"), part.edges, {"part": part.name})
+    write_views(run.path("views.npz"), views)
+    return {"views": len(views), "width_px": views.width, "height_px": views.height, "part": part.name}
+
+
+def train(run):
+    """`views.npz` -> `gaussians.ply` (input frame) and `train_log.csv`."""
+    from taichi_edges.exporters.splats import write_gaussians
+    from taichi_edges.splatting.gaussians import start_gaussians
+    from taichi_edges.splatting.seeding import random_points
+    from taichi_edges.splatting.training import Training, start_taichi
+
+    config, views = run.config.train, read_views(run.path("views.npz"))
+    generator = np.random.default_rng(run.config.seed)
+    start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)
+    points = random_points(config.gaussians, views.box, generator)
+    start = start_gaussians(points, generator, config.initial_scale, config.initial_opacity)
+    training = Training(views, config, generator, run.threads, run.arch)
+    gaussians, records = training.run(start, run.progress)
+    rows = [("epoch", "seconds", "loss", "gaussians")]
+    rows += [(r.epoch, f"{r.seconds:.3f}", f"{r.loss:.6f}", r.gaussians) for r in records]
+    _write_csv(run.path("train_log.csv"), rows)
+    similarity = views.similarity
+    write_gaussians(
+        run.path("gaussians.ply"),
+        similarity.to_input(gaussians.means).astype(np.float32),
+        gaussians.log_scales - np.float32(np.log(similarity.scale)),
+        gaussians.quaternions,
+        gaussians.opacity_logits,
+    )
+    return {"gaussians": len(gaussians), "view_steps": training.step, "final_loss": records[-1].loss}
+
+
+def _write_csv(path, rows):
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    write_text(path, text.getvalue())
+
+
+def cluster(run):
+    """`gaussians.ply`, `views.npz` -> `points.ply` (filtered oriented points, input frame) and `clusters.npz`."""
+    from taichi_edges.exporters.point_cloud import write_oriented_points
+    from taichi_edges.exporters.splats import read_gaussians
+    from taichi_edges.splatting.gaussians import Gaussians
+
+    views = read_views(run.path("views.npz"))
+    gaussians = Gaussians(*read_gaussians(run.path("gaussians.ply")))
+    means = views.similarity.to_unit(gaussians.means.astype(np.float64))
+    threshold = run.config.train.edge_threshold
+    points, directions, counts = filter_points(
+        means, gaussians.directions(), gaussians.opacities, views, run.config.filter, threshold
+    )
+    if len(points) == 0:
+        raise UserError(
+            f"{run.path('gaussians.ply')}: none of {len(means)} Gaussians passed the filters ({_in_words(asdict(counts))}); "
+            "train longer, or lower filter.min_opacity or filter.min_support"
+        )
+    labels = grow_clusters(points, directions, run.config.cluster)
+    write_oriented_points(run.path("points.ply"), views.similarity.to_input(points), directions, labels)
+    with replacing(run.path("clusters.npz")) as unfinished, open(unfinished, "wb") as file:
+        np.savez_compressed(file, points=points, directions=directions, labels=labels)
+    return {**asdict(counts), "points": len(points), "clusters": int(labels.max() + 1), "unclustered": int((labels < 0).sum())}
+
+
+def _in_words(counts):
+    """'5 low opacity, 3 outliers' from a dict of counts."""
+    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
+
+
+def fit(run):
+    """`clusters.npz` -> `edges.json` (input frame)."""
+    views = read_views(run.path("views.npz"))
+    with np.load(run.path("clusters.npz")) as archive:
+        edges, counts = fit_clusters(archive["points"], archive["labels"], run.config.fit)
+    clusters = {kind: counts[kind] for kind in ("line", "curve", "loop", "short", "degenerate")}
+    about = {"frame": "input", "clusters": clusters, "scene": run.config.name, "seed": run.config.seed}
+    write_edges(run.path("edges.json"), edges.transformed(views.similarity.to_input), about)
+    if len(edges) == 0:
+        run.progress.warn(f"no edge was found in {sum(clusters.values())} clusters; see the counts in run.json")
+    return {"lines": len(edges.lines), "curves": len(edges.curves), **{f"{kind}_clusters": n for kind, n in clusters.items()}}
+
+
+def truth_path(run):
+    """The ground truth of the scene, or None: what the scene names, or what the synthetic source wrote."""
+    if run.config.evaluation.truth:
+        return run.data_path(run.config.evaluation.truth, "evaluation.truth")
+    return run.path("truth.json") if run.config.source.reader == "synthetic" else None
+
+
+def evaluate(run):
+    """`edges.json` and the ground truth -> `metrics.json` and `metrics.csv` (EMAP's protocol)."""
+    from taichi_edges.evaluation.ground_truth import read_ground_truth
+    from taichi_edges.evaluation.metrics import evaluate as measure
+
+    edges, _ = read_edges(run.path("edges.json"))
+    path = truth_path(run)
+    if path is None:
+        metrics = {"lines": len(edges.lines), "curves": len(edges.curves), "ground_truth": None}
+    else:
+        to_truth = read_views(run.path("views.npz")).input_to_truth
+        moved = edges.transformed(lambda points: points @ to_truth[:3, :3].T + to_truth[:3, 3])
+        truth = read_ground_truth(path)
+        metrics = {**measure(moved, truth), "ground_truth": truth.source}
+    write_json(run.path("metrics.json"), metrics)
+    _write_csv(run.path("metrics.csv"), [("metric", "value"), *metrics.items()])
+    return metrics
+
+
+def export(run):
+    """`edges.json` and `views.npz` -> `edges.ply`, `edges.obj`, pictures in `overlays/` and `overlays.png`."""
+    from taichi_edges.exporters import EXPORTERS
+    from taichi_edges.exporters.overlays import contact_sheet, draw_overlays
+
+    edges, _ = read_edges(run.path("edges.json"))
+    views = read_views(run.path("views.npz"))
+    written = []
+    for suffix, write in EXPORTERS.items():
+        path = run.path(f"edges{suffix}")
+        if len(edges):
+            write(path, edges)
+            written.append(path.name)
+        else:
+            path.unlink(missing_ok=True)  # an older run's edges must not pass for this one's
+    for stale in run.path("overlays").glob("*.png"):
+        stale.unlink()
+    pictures = draw_overlays(run.path("overlays"), views, edges.transformed(views.similarity.to_unit))
+    contact_sheet(pictures, run.path("overlays.png"))
+    return {"files": [*written, "overlays.png", *(f"overlays/{path.name}" for path in pictures)]}
+
+
+def source_files(run):
+    """Every file the prepare stage reads, so that a changed input is noticed."""
+    source = run.config.source
+    if source.reader == "synthetic":
+        return []
+    folder = run.data_path(source.path, "source.path")
+    listing = folder / (f"transforms_{source.split}.json" if source.reader == "nerf" else "meta_data.json")
+    folders = {folder / name for name in (source.edges or source.split, source.images) if name}
+    return [listing, *sorted(path for place in folders if place.is_dir() for path in place.iterdir() if path.is_file())]
+
+
+def truth_files(run):
+    """Every file the ground truth consists of."""
+    path = truth_path(run)
+    if path is None:
+        return []
+    return sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [Path(path)]
+
+
+def read_facts(path):
+    """A JSON artefact as a dict; {} where it is not there or damaged (then the stage runs again)."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
