@@ -2,6 +2,7 @@
 """Parametric 3D edges from posed images: `python run.py scenes/abc_00000006.yaml`. Argument parsing only."""
 
 import argparse
+import os
 import sys
 
 STAGES = ("prepare", "train", "cluster", "fit", "evaluate", "export")
@@ -31,14 +32,19 @@ def parse_arguments(arguments=None):
 def main(arguments=None):
     """Run from the command line. Returns the exit status: 0, or 2 for a mistake the user can put right."""
     options = parse_arguments(arguments)
-    from taichi_edges.command import run_command
     from taichi_edges.errors import UserError
 
     try:
+        from taichi_edges.command import run_command
+
         run_command(options)
+        sys.stdout.flush()
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # the reader of the summary has closed it, as `| head` does; all artefacts are written
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except KeyboardInterrupt:
         print("interrupted; the same command resumes with the stage it was in", file=sys.stderr)
         return 130

@@ -20,6 +20,27 @@ def replacing(path):
         unfinished.unlink(missing_ok=True)
 
 
+def remove_unfinished(folder):
+    """Delete the temporary files that a killed run has left below `folder`; those of a living process stay."""
+    for path in Path(folder).rglob(".*.unfinished*"):
+        process = path.name.partition(".unfinished")[0].rpartition(".")[2]
+        if process.isdigit() and not _is_alive(int(process)):
+            path.unlink(missing_ok=True)
+
+
+def _is_alive(process):
+    """Is there a process of this number? Our own does not count: what it writes now is not there yet."""
+    if process == os.getpid():
+        return False
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True  # it belongs to someone else
+    return True
+
+
 def write_text(path, text):
     """Write a text file, all of it or nothing."""
     with replacing(path) as unfinished:

@@ -12,6 +12,8 @@ from taichi_edges.scene import load_scene
 def run_command(options):
     """Run what the parsed command line `options` asks for; mistakes of the user raise UserError."""
     config = load_scene(options.scene, options.preset, options.set, options.seed)
+    if options.show and options.until and list(STAGES).index(options.until) < list(STAGES).index("fit"):
+        raise UserError(f"--show needs the edges, but --until {options.until} stops before fit; leave one of them out")
     data = options.data or os.environ.get("TAICHI_EDGES_DATA")
     if data and not Path(data).expanduser().is_dir():
         origin = "--data" if options.data else "TAICHI_EDGES_DATA"
@@ -46,7 +48,7 @@ def print_summary(run, record, until=None):
     rows = []
     for name in done:
         stage = record["stages"][name]
-        seconds = f"{stage['seconds']:.1f} s" + (" (earlier)" if stage.get("skipped") else "")
+        seconds = f"{stage['seconds']:.1f} s" + ("" if name in record["ran"] else " (earlier)")
         rows.append((name, seconds, f"{stage['peak_memory_mib']:.0f} MiB"))
     if "evaluate" in done:
         from taichi_edges.evaluation.metrics import metrics_rows
@@ -58,7 +60,9 @@ def print_summary(run, record, until=None):
             found = metrics_rows(metrics)
         _print_table(f"{run.config.name}: metrics", ("metric", "value"), found)
     _print_table(f"{run.config.name}: stages", ("stage", "time", "peak memory"), rows)
-    print(f"results: {run.folder}/" + ("  (edges.json, edges.ply, edges.obj, overlays.png)" if "export" in done else ""))
+    written = ["edges.json", *record["stages"]["export"]["facts"]["files"]] if "export" in done else []
+    files = ", ".join(name for name in written if "/" not in name)
+    print(f"results: {run.folder}/" + (f"  ({files})" if files else ""))
 
 
 def _print_table(title, headings, rows):

@@ -6,8 +6,12 @@ import difflib
 class UserError(Exception):
     """A mistake in the input. Its text is one line: where (file, key, view), what is wrong, what to do.
 
-    `run.py` prints it without a traceback and exits with status 2.
+    `run.py` prints it without a traceback and exits with status 2. What it quotes (a key, a file name, another
+    library's message) may hold line breaks; they become spaces.
     """
+
+    def __init__(self, text):
+        super().__init__(" ".join(str(text).split()))
 
 
 def did_you_mean(name, known):

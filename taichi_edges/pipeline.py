@@ -6,6 +6,7 @@ user wants to start after is refused when it is missing or stale.
 """
 
 import contextlib
+import errno
 import os
 import platform
 import resource
@@ -20,10 +21,13 @@ import yaml
 
 import taichi_edges
 from taichi_edges import stages
-from taichi_edges.artefacts import digest, digest_file, write_json, write_text
+from taichi_edges.artefacts import digest, digest_file, remove_unfinished, write_json, write_text
 from taichi_edges.errors import UserError
+from taichi_edges.findings import FINDINGS
 from taichi_edges.progress import Progress
 
+STAGE_KEYS = {"seconds", "peak_memory_mib", "fingerprint", "inputs", "outputs", "facts"}
+DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR)
 PACKAGES = ("taichi", "numpy", "scipy", "opencv-python-headless", "open3d", "open3d-cpu", "pycolmap")
 
 
@@ -32,7 +36,8 @@ class Stage:
     """One stage of the corridor.
 
     sections: the keys of the scene its result depends on ('a.b' reaches into a section). reads: artefacts of earlier
-    stages. writes: its own. outside: function of the Run that lists the input files it reads beyond those.
+    stages. writes: its own. outside: function of the Run that lists the input files it reads beyond those, and raises
+    UserError where the scene names one that is not there. on_device: whether threads and arch matter to its result.
     """
 
     function: Callable
@@ -44,7 +49,9 @@ class Stage:
 
 
 STAGES = {
-    "prepare": Stage(stages.prepare, ("source", "box", "seed"), (), ("views.npz",), stages.source_files),
+    "prepare": Stage(
+        stages.prepare, ("source", "box", "seed", "train.edge_threshold"), (), ("views.npz",), stages.source_files
+    ),
     "train": Stage(stages.train, ("train", "seed"), ("views.npz",), ("gaussians.ply", "train_log.csv"), on_device=True),
     "cluster": Stage(
         stages.cluster,
@@ -89,7 +96,8 @@ class Run:
         path = Path(text).expanduser()
         if not path.is_absolute():
             if self.data_root is None:
-                raise UserError(f"{key}: {text} is relative to the data root; give --data FOLDER or set TAICHI_EDGES_DATA")
+                problem = f"{text} is relative to the data root, and there is none"
+                raise UserError(f"{key}: {problem}; give --data FOLDER or set TAICHI_EDGES_DATA")
             path = self.data_root / path
         if not path.exists():
             raise UserError(f"{key}: {path} does not exist; correct {key}, --data or TAICHI_EDGES_DATA")
@@ -99,32 +107,37 @@ class Run:
 def run_stages(run, start=None, until=None):
     """Run the corridor. start: this stage and those after it run anew; until: stop after this one.
 
-    Without `start`, every stage that is up to date is skipped. Returns the record that `run.json` holds.
+    Without `start`, every stage that is up to date is skipped. Returns the record that `run.json` holds; its key "ran"
+    lists the stages that were not skipped.
     """
     names = list(STAGES)
     first = names.index(start) if start else 0
     last = names.index(until) if until else len(names) - 1
     if first > last:
         raise UserError(f"--stage {start} comes after --until {until}; the order is {' '.join(names)}")
+    for name in names[: last + 1]:
+        STAGES[name].outside(run)  # a mistyped path must not come to light after the training
     record = _open_record(run)
     for name in names[:first]:
         _refuse_stale(run, record, name)
-    redo = False
     for name in names[first : last + 1]:
-        redo = redo or start is not None
-        _run_stage(run, record, name, force=redo)
+        _run_stage(run, record, name, force=start is not None)
     return record
 
 
 def _open_record(run):
     """The run's record, with what is known before any stage: the resolved scene, versions, machine."""
+    scene = run.config.model_dump()
     try:
         run.folder.mkdir(parents=True, exist_ok=True)
+        remove_unfinished(run.folder)
+        write_text(run.path("scene.yaml"), yaml.safe_dump(scene, sort_keys=False))
     except OSError as error:
-        raise UserError(f"{run.folder}: cannot be created ({error.strerror}); choose another folder with --out") from error
-    old = stages.read_facts(run.path("run.json"))
-    scene = run.config.model_dump()
-    record = {
+        problem = f"cannot be written to ({error.strerror})"
+        raise UserError(f"{run.folder}: {problem}; choose another folder with --out") from error
+    old = stages.read_facts(run.path("run.json")).get("stages")
+    known = old.items() if isinstance(old, dict) else ()
+    return {
         "taichi_edges": taichi_edges.__version__,
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "scene": scene,
@@ -132,14 +145,13 @@ def _open_record(run):
         "arch": run.arch,
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
         "versions": _versions(),
-        "stages": old.get("stages", {}),
+        "ran": [],
+        "stages": {name: stage for name, stage in known if isinstance(stage, dict) and set(stage) >= STAGE_KEYS},
     }
-    write_text(run.path("scene.yaml"), yaml.safe_dump(scene, sort_keys=False))
-    return record
 
 
 def _versions():
-    found = {}
+    found = {"taichi_edges": taichi_edges.__version__}
     for package in PACKAGES:
         with contextlib.suppress(PackageNotFoundError):
             found[package] = version(package)
@@ -159,49 +171,68 @@ def _settings(run, stage):
     return values
 
 
-def _fingerprint(run, stage):
-    """What the stage depends on: settings, versions, and the digest of every file it reads."""
-    files = {path.name: digest_file(run.path(path.name)) for path in map(run.path, stage.reads)}
-    outside = {str(path): digest_file(path) for path in stage.outside(run) if path.exists()}
-    return digest([_settings(run, stage), files, outside, taichi_edges.__version__, _versions()])
+def _inputs(run, stage):
+    """What the stage depends on: its settings, the versions, and the digest of every file it reads."""
+    files = {artefact: digest_file(run.path(artefact)) for artefact in stage.reads}
+    files |= {_label(run, path): digest_file(path) for path in stage.outside(run) if path.exists()}
+    return {"settings": _settings(run, stage), "files": files, "versions": _versions()}
 
 
-def _state(run, record, name):
-    """'fresh', or why not: 'missing', 'changed' (settings or inputs) or 'touched' (an output is not what it wrote)."""
+def _label(run, path):
+    """A file's path, relative to the run's folder where it lies in it: a folder that was moved is not stale."""
+    return str(path.relative_to(run.folder)) if path.is_relative_to(run.folder) else str(path)
+
+
+def _why_stale(run, record, name):
+    """None where a stage is up to date, else (artefact, why it is not what the stage would write now)."""
     stage, known = STAGES[name], record["stages"].get(name)
-    missing = [artefact for artefact in (*stage.reads, *stage.writes) if not run.path(artefact).exists()]
+    missing = [artefact for artefact in stage.writes if not run.path(artefact).exists()]
     if known is None or missing:
-        return "missing"
-    if known["fingerprint"] != _fingerprint(run, stage):
-        return "changed"
-    same = all(digest_file(run.path(artefact)) == known["outputs"].get(artefact) for artefact in stage.writes)
-    return "fresh" if same else "touched"
+        return (*missing, *stage.writes)[0], f"not there yet, the {name} stage has not finished"
+    unread = [artefact for artefact in stage.reads if not run.path(artefact).exists()]
+    if unread:
+        return stage.writes[0], f"stale: {unread[0]}, which the {name} stage reads, is gone"
+    inputs = _inputs(run, stage)
+    if known["fingerprint"] != digest(inputs):
+        changes = _changes(known["inputs"], inputs)
+        more = f" and {len(changes) - 3} more" if len(changes) > 3 else ""
+        return stage.writes[0], f"stale: {'; '.join(changes[:3]) or 'its inputs have changed'}{more}"
+    for artefact, digest_then in known["outputs"].items():
+        if not run.path(artefact).exists():
+            return artefact, f"is gone since the {name} stage wrote it"
+        if digest_file(run.path(artefact)) != digest_then:
+            return artefact, f"is not the file that the {name} stage wrote"
+    return None
 
 
 def _refuse_stale(run, record, name):
-    """UserError unless the stage before the one asked for is up to date."""
-    state = _state(run, record, name)
-    if state == "fresh":
-        return
-    stage = STAGES[name]
-    artefact = next((a for a in stage.writes if not run.path(a).exists()), stage.writes[0])
-    cure = f"run again without --stage, or with --stage {name}"
-    if state == "missing":
-        raise UserError(f"{run.path(artefact)}: not there yet, the {name} stage has not finished; {cure}")
-    if state == "touched":
-        raise UserError(f"{run.path(artefact)}: is not the file that the {name} stage wrote; {cure}")
-    changes = _changes(record["stages"][name].get("settings", {}), _settings(run, stage))
-    why = "; ".join(changes[:3]) or "its input files or the installed versions have changed"
-    raise UserError(f"{run.path(artefact)}: stale: {why}; {cure}")
+    """UserError unless the stage, one before those asked for, is up to date."""
+    stale = _why_stale(run, record, name)
+    if stale:
+        artefact, why = stale
+        raise UserError(f"{run.path(artefact)}: {why}; run again without --stage, or with --stage {name}")
 
 
-def _changes(old, new, prefix=""):
-    """'train.epochs was 500, is now 100' for every value that differs."""
+def _changes(old, new):
+    """What differs between two `_inputs`: 'train.epochs was 500, is now 100', 'views.npz has changed'."""
+    changes = _changed_values(old.get("settings", {}), new["settings"])
+    before, now = old.get("files", {}), new["files"]
+    for path in [*now, *(path for path in before if path not in now)]:
+        if before.get(path) != now.get(path):
+            what = "has changed" if path in before and path in now else "is new" if path in now else "is gone"
+            changes.append(f"{path} {what}")
+    return changes + _changed_values(old.get("versions", {}), new["versions"], "the version of ")
+
+
+def _changed_values(old, new, prefix=""):
+    """'train.epochs was 500, is now 100' for every value that differs between two nested dicts."""
     found = []
     for key in [*new, *(key for key in old if key not in new)]:
         before, now = old.get(key), new.get(key)
         if isinstance(before, dict) and isinstance(now, dict):
-            found += _changes(before, now, f"{prefix}{key}.")
+            found += _changed_values(before, now, f"{prefix}{key}.")
+        elif key not in old or key not in new:
+            found.append(f"{prefix}{key} is {'new' if key in new else 'gone'}")
         elif before != now:
             found.append(f"{prefix}{key} was {before}, is now {now}")
     return found
@@ -209,39 +240,34 @@ def _changes(old, new, prefix=""):
 
 def _run_stage(run, record, name, force):
     """Run one stage, or skip it where it is up to date; keep the record on disk."""
-    stage = STAGES[name]
-    if not force and _state(run, record, name) == "fresh":
-        run.progress.say(f"{name}: up to date ({record['stages'][name]['seconds']:.1f} s when it ran)")
-        record["stages"][name]["skipped"] = True
+    stage, known = STAGES[name], record["stages"].get(name)
+    stale = _why_stale(run, record, name)
+    if not force and not stale:
+        run.progress.say(f"{name}: up to date ({known['seconds']:.1f} s when it ran)")
         return
-    run.progress.say(f"{name} ...")
+    run.progress.say(f"{name} again ({stale[0]}: {stale[1]})" if known and stale else f"{name} ...")
     _reset_peak_memory()
     started = time.perf_counter()
-    facts = stage.function(run)
-    record["stages"][name] = {
-        "seconds": round(time.perf_counter() - started, 3),
-        "peak_memory_mib": round(_peak_memory_mib(), 1),
-        "fingerprint": _fingerprint(run, stage),
-        "settings": _settings(run, stage),
-        "outputs": {artefact: digest_file(run.path(artefact)) for artefact in stage.writes},
-        "facts": facts,
-    }
-    write_json(run.path("run.json"), record)
-    run.progress.say(f"{name}: {describe_facts(facts)} ({record['stages'][name]['seconds']:.1f} s)")
-
-
-def describe_facts(facts):
-    """'50 views, 800 width px' : the counts of a stage in one line; nested values and texts are left to run.json."""
-    units = (("_px", " px"), ("_mm", " mm"), ("_percent", " %"), ("_units", " units"))
-    parts = []
-    for key, value in facts.items():
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            continue
-        number = f"{value}" if isinstance(value, int) else f"{value:.4g}"
-        suffix = next(((end, unit) for end, unit in units if key.endswith(end)), ("", ""))
-        label = key.removesuffix(suffix[0]).replace("_", " ")
-        parts.append(f"{number}{suffix[1]} {label}")
-    return ", ".join(parts[:6]) or "done"
+    try:
+        inputs = _inputs(run, stage)
+        facts = stage.function(run)
+        outputs = [*stage.writes, *facts.get("files", [])]
+        record["stages"][name] = {
+            "seconds": round(time.perf_counter() - started, 3),
+            "peak_memory_mib": round(_peak_memory_mib(), 1),
+            "fingerprint": digest(inputs),
+            "inputs": inputs,
+            "outputs": {artefact: digest_file(run.path(artefact)) for artefact in outputs},
+            "facts": facts,
+        }
+        record["ran"].append(name)
+        write_json(run.path("run.json"), record)
+    except OSError as error:
+        if error.errno not in DISK_TROUBLE:
+            raise
+        problem = f"{error.strerror} in the {name} stage"
+        raise UserError(f"{error.filename or run.folder}: {problem}; put that right and repeat the command") from error
+    run.progress.say(f"{name}: {FINDINGS[name](facts)} ({record['stages'][name]['seconds']:.1f} s)")
 
 
 def _reset_peak_memory():

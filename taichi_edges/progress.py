@@ -78,15 +78,15 @@ class TerminalProgress(PlainProgress):
         from rich.console import Console
         from rich.progress import BarColumn, Progress as Bars, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-        self.console = Console(stderr=True, highlight=False)
+        self.console = Console(stderr=True, highlight=False, emoji=False)
         columns = [TextColumn("  {task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()]
         self.bars = Bars(*columns, TextColumn("{task.fields[note]}"), console=self.console, transient=True)
 
     def say(self, text):
-        self.console.print(text, markup=False)
+        self.console.print(text, markup=False, soft_wrap=True)  # the terminal may wrap, but paths stay in one piece
 
     def warn(self, text):
-        self.console.print(f"warning: {text}", style="yellow", markup=False)
+        self.console.print(f"warning: {text}", style="yellow", markup=False, soft_wrap=True)
 
     def _update(self, task, done, note):
         if task.handle is None:

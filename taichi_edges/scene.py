@@ -18,6 +18,7 @@ Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 Count = Annotated[int, Field(ge=1)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 Point = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
@@ -36,6 +37,8 @@ class SourceConfig(Section):
     images: str = Field("", description="folder of the colour images inside `path`; optional, for the overlays")
     split: str = Field("train", description="nerf: which transforms_<split>.json")
     axes: Literal["auto", "opengl", "opencv"] = Field("auto", description="camera axes; auto: what the layout means")
+    thin: bool = Field(True, description="reduce the lines of the edge maps to their ridges and redraw them thin")
+    thin_threshold: Share = Field(0.3, description="of full scale; ridges of the edge maps below are dropped")
     skip: list[str] = Field([], description="names of views to leave out")
     part: str = Field("demo", description="synthetic: which of the generator's parts")
     views: Count = Field(30, description="synthetic: number of views")
@@ -54,15 +57,15 @@ class LearningRates(Section):
 class DensityConfig(Section):
     """Culling and duplication "at regular intervals" (supplement): the epochs after which they happen."""
 
-    duplicate_epochs: list[int] = Field([*range(40, 161, 10), 210, 220, 350, 375], description="epochs")
+    duplicate_epochs: list[Count] = Field([*range(40, 161, 10)], description="epochs")
     duplicate_gradient: Share = Field(0.5, description="relative positional gradient from which on to duplicate")
     duplicate_copies: Annotated[int, Field(ge=0)] = Field(2, description="copies of each")
     duplicate_distance: NotNegative = Field(0.01, description="standard deviation of a copy's offset, unit-cube units")
     max_gaussians: Count = Field(50_000, description="no duplication beyond this number")
-    cull_opacity_epochs: list[int] = Field([125, 310, 450], description="epochs")
+    cull_opacity_epochs: list[Count] = Field([125, 310, 450], description="epochs")
     min_opacity: Share = Field(0.05, description="Gaussians below are culled")
-    cull_support_epochs: list[int] = Field([145, 175, 190], description="epochs")
-    min_support: Share = Field(0.1, description="share of the views whose edge pixels a centre must hit")
+    cull_support_epochs: list[Count] = Field([100, 150, 200, 250, 350, 450], description="epochs")
+    min_support: Share = Field(0.05, description="share of the views whose edge pixels a centre must hit")
     reset_opacity: bool = Field(True, description="opacities down to the initial one after a cull")
 
 
@@ -94,7 +97,7 @@ class FilterConfig(Section):
     """Which trained Gaussians become oriented points."""
 
     min_opacity: Share = Field(0.2)
-    min_support: Share = Field(0.15, description="share of the views that see a point and have an edge pixel there")
+    min_support: Share = Field(0.05, description="share of the views that see a point and have an edge pixel there")
     outlier_neighbors: Annotated[int, Field(ge=0)] = Field(10, description="statistical outliers: neighbours; 0: off")
     outlier_deviations: Positive = Field(5.0, description="mean neighbour distance allowed, standard deviations")
 
@@ -125,9 +128,9 @@ class EvaluationConfig(Section):
 class SceneConfig(Section):
     """A whole scene."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]+$")] = Field("scene", description="folder below runs/")
+    name: Name = Field("scene", description="folder of the results; the file's name unless set")
     preset: Literal["paper"] = Field("paper", description="the schedule the scene starts from")
-    seed: Annotated[int, Field(ge=0)] = Field(0, description="of every random choice")
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of every random choice")
     box: Annotated[list[Point], Field(min_length=2, max_length=2)] = Field(
         [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], description="opposite corners of the scene, input units"
     )
@@ -148,7 +151,7 @@ class SceneConfig(Section):
     @model_validator(mode="after")
     def _source_has_path(self):
         if self.source.reader != "synthetic" and not self.source.path:
-            raise ValueError("source.path is missing: the folder with the images and cameras")
+            raise ValueError("source.path is missing; set it to the folder with the images and cameras")
         return self
 
 
@@ -180,20 +183,24 @@ class _SceneLoader(yaml.SafeLoader):
     """YAML 1.1 reads 1e-3 as a string; a number in a scene file is a number. Repeated keys are refused."""
 
     def construct_mapping(self, node, deep=False):
-        keys = [key.value for key, _ in node.value]
-        for key_node, _ in node.value:
-            if keys.count(key_node.value) > 1:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key '{key_node.value}' is given twice", key_node.start_mark
-                )
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key.value, str) and key.value in seen:
+                problem = f"the key '{key.value}' is given twice; leave one of them out"
+                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+            seen.add(str(key.value))
         return super().construct_mapping(node, deep)
 
 
 _FLOAT = re.compile(r"^[-+]?(\.[0-9]+|[0-9][0-9_]*(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$")
+# YAML 1.1 also reads 010 as eight and 1:30 as ninety; here they stay texts, and are refused where a number belongs.
+_INT = re.compile(r"^[-+]?(0|[1-9][0-9_]*|0x[0-9a-fA-F_]+)$")
+_NUMBERS = ("tag:yaml.org,2002:float", "tag:yaml.org,2002:int")
 _SceneLoader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:float"]
+    first: [(tag, pattern) for tag, pattern in resolvers if tag not in _NUMBERS]
     for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
+_SceneLoader.add_implicit_resolver("tag:yaml.org,2002:int", _INT, list("-+0123456789"))
 _SceneLoader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789."))
 
 
@@ -204,8 +211,8 @@ def parse_yaml(text, where):
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         place = f" line {mark.line + 1}, column {mark.column + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or "cannot be read"
-        raise UserError(f"{where}:{place} is not valid YAML: {' '.join(str(problem).split())}") from error
+        problem = getattr(error, "problem", None) or "it holds control characters; is it a text file?"
+        raise UserError(f"{where}:{place}{':' if place else ''} not valid YAML: {problem}") from error
 
 
 def merge(base, over):
@@ -227,70 +234,132 @@ def load_scene(path, preset=None, settings=(), seed=None):
     except UnicodeDecodeError as error:
         raise UserError(f"{path}: is not a text file; a scene is a YAML file, see scenes/") from error
     except OSError as error:
-        raise UserError(f"{path}: {error.strerror}; the scenes that come along are in scenes/") from error
+        raise UserError(f"{path}: {_why_unreadable(path, error)}") from error
     content = parse_yaml(text, path)
     if not isinstance(content, dict):
-        raise UserError(f"{path}: a scene is a mapping of keys, see scenes/demo.yaml for an example")
+        what = "it is empty" if content is None else f"this is {_in_yaml(content)}"
+        raise UserError(f"{path}: {what}, but a scene is a mapping of keys; see scenes/demo.yaml for an example")
     content = {"name": path.stem, **content}
-    base = PRESETS.get(content.get("preset", "paper"), {})
-    content = merge(base, content)
+    base = content.get("preset", "paper")
+    content = merge(PRESETS.get(base, {}) if isinstance(base, str) else {}, content)
     if preset is not None:
+        if preset not in PRESETS:
+            raise UserError(f"--preset {preset}: there is no such preset; there is {', '.join(PRESETS)}")
         content = merge(content, {"preset": preset, **PRESETS[preset]})
+    origins = {}
     for setting in settings:
-        content = merge(content, _parse_setting(setting))
+        keys, value = _parse_setting(setting)
+        origins[keys] = f"--set {setting}"
+        for name in reversed(keys):
+            value = {name: value}
+        content = merge(content, value)
     if seed is not None:
         content["seed"] = seed
-    return check_scene(content, path)
+        origins[("seed",)] = f"--seed {seed}"
+    return check_scene(content, path, origins)
+
+
+def _why_unreadable(path, error):
+    """What is wrong with a scene's path; a scene of a similar name in the same folder is named."""
+    elsewhere = "; the scenes that come along are in scenes/"
+    if path.is_dir():
+        return f"is a folder, not a scene file{elsewhere}"
+    near = did_you_mean(path.name, [p.name for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else [])
+    return f"{error.strerror}{near or elsewhere}"
 
 
 def _parse_setting(setting):
-    """'train.epochs=100' -> {'train': {'epochs': 100}}."""
+    """'train.epochs=100' -> (('train', 'epochs'), 100)."""
     key, equals, value = setting.partition("=")
-    if not equals or not key.strip():
+    keys = tuple(key.strip().split("."))
+    if not equals or not all(keys):
         raise UserError(f"--set {setting}: write key=value, e.g. --set train.epochs=100")
-    nested = parse_yaml(value, f"--set {key.strip()}")
-    for name in reversed(key.strip().split(".")):
-        nested = {name: nested}
-    return nested
+    if keys == ("preset",):
+        raise UserError(f"--set {setting}: a preset brings many values with it; use --preset{value and ' '}{value}")
+    return keys, parse_yaml(value, f"--set {key.strip()}")
 
 
-def check_scene(content, where):
-    """A dict -> SceneConfig; the first mistake becomes one line with file, key and what to do."""
+def check_scene(content, where, origins=None):
+    """A dict -> SceneConfig; the first mistake becomes one line with file, key and what to do.
+
+    where: the file, for the message. origins: {keys: text} names other places that values come from, e.g. `--set`.
+    """
     try:
         return SceneConfig.model_validate(content)
     except ValidationError as error:
-        raise UserError(_describe(error.errors()[0], len(error.errors()), where)) from error
+        problem = error.errors()[0]
+        for keys, text in (origins or {}).items():
+            if all(mine == theirs for mine, theirs in zip(keys, problem["loc"])) and problem["loc"]:
+                where = text
+        raise UserError(_describe(problem, len(error.errors()), where)) from error
+
+
+# Pydantic's types of mistakes in the words of a scene file; {} are the values pydantic gives with the mistake.
+_WORDS = {
+    "int_type": "must be a whole number",
+    "float_type": "must be a number",
+    "bool_type": "must be true or false",
+    "string_type": "must be a text, in quotes",
+    "list_type": "must be a list, [...]",
+    "model_type": "must be a section with keys of its own",
+    "finite_number": "must be a finite number",
+    "greater_than": "must be greater than {gt:g}",
+    "greater_than_equal": "must be at least {ge:g}",
+    "less_than": "must be less than {lt:g}",
+    "less_than_equal": "must be at most {le:g}",
+    "too_short": "must have {min_length} entries, not {actual_length}",
+    "too_long": "must have {max_length} entries, not {actual_length}",
+    "literal_error": "must be {expected}",
+    "string_pattern_mismatch": "may hold only letters, digits, '.', '_' and '-', and must start with a letter or digit",
+    "invalid_key": "a key must be a text",
+}
 
 
 def _describe(problem, count, where):
     """One line for pydantic's first finding."""
-    key = ".".join(str(part) for part in problem["loc"])
-    more = f" (and {count - 1} more)" if count > 1 else ""
+    location, context = problem["loc"], problem.get("ctx", {})
+    key = ".".join(str(part) for part in location)
+    more = f" (and {count - 1} more mistake{'s' if count > 2 else ''})" if count > 1 else ""
     if problem["type"] == "extra_forbidden":
-        known = _known_keys(problem["loc"][:-1])
-        name = str(problem["loc"][-1])
-        hint = did_you_mean(name, known) or _elsewhere(name) or f"; known here: {', '.join(known)}"
-        return f"{where}: {key}: unknown key{hint}{more}"
-    message = problem["msg"].removeprefix("Value error, ")
+        return f"{where}: {key}: unknown key{_nearest_key(location)}{more}"
+    message = _WORDS.get(problem["type"], problem["msg"].removeprefix("Value error, ")).format(**context)
     value = problem.get("input")
-    given = f", not {value!r}" if isinstance(value, (str, int, float, bool, type(None))) else ""
+    simple = isinstance(value, (str, int, float, type(None))) and problem["type"] != "invalid_key"
+    given = f", not {_in_yaml(value)}" if simple else ""
+    meaning = _meaning(location)
     place = f"{key}: " if key else ""
-    return f"{where}: {place}{message[0].lower() + message[1:]}{given}{more}"
+    return f"{where}: {place}{message}{given}{f' ({meaning})' if meaning else ''}{more}"
 
 
-def _known_keys(location):
-    """The keys of the section at `location`, a tuple of names."""
+def _in_yaml(value):
+    """A value as the user would write it: true, null, 'text'."""
+    if isinstance(value, (dict, list)):
+        return "a mapping" if isinstance(value, dict) else "a list"
+    return {True: "true", False: "false", None: "null"}[value] if isinstance(value, (bool, type(None))) else repr(value)
+
+
+def _section_at(location):
+    """The Section class at `location`, a tuple of names; None where there is none."""
     section = SceneConfig
     for name in location:
-        annotation = section.model_fields[name].annotation
-        if not (isinstance(annotation, type) and issubclass(annotation, Section)):
-            return []
-        section = annotation
-    return list(section.model_fields)
+        field = section.model_fields.get(name)
+        section = field.annotation if field else None
+        if not (isinstance(section, type) and issubclass(section, Section)):
+            return None
+    return section
 
 
-def _elsewhere(name):
-    """A hint where the same or a similar key stands in another section."""
+def _meaning(location):
+    """What the key at `location` means, with its unit, as its field says."""
+    names = [part for part in location if isinstance(part, str)]
+    section = _section_at(names[:-1]) if names else None
+    field = section.model_fields.get(names[-1]) if section else None
+    return (field.description or "") if field else ""
+
+
+def _nearest_key(location):
+    """A hint for an unknown key: the same key in another section, a similar one here or elsewhere, or all there are."""
+    name, known = str(location[-1]), list(_section_at(location[:-1]).model_fields)
     places = {}
 
     def collect(section, prefix):
@@ -300,5 +369,9 @@ def _elsewhere(name):
                 collect(value.annotation, f"{prefix}{key}.")
 
     collect(SceneConfig, "")
-    near = difflib.get_close_matches(name, list(places), n=1, cutoff=0.7)
-    return f"; did you mean '{places[near[0]]}'?" if near else ""
+    closeness = {key: difflib.SequenceMatcher(None, name, key).ratio() for key in places}
+    here = max(known, key=closeness.get)
+    anywhere = max(places, key=closeness.get)
+    if closeness[anywhere] > max(closeness[here], 0.7):
+        return f"; did you mean '{places[anywhere]}'?"
+    return did_you_mean(name, [here]) or f"; known here: {', '.join(known)}"

@@ -1,23 +1,28 @@
 """The stages: each reads the artefacts of those before it from the run's folder and writes its own.
 
-A stage is a plain function of a Run that returns the facts it found (JSON-able), which `run.json` keeps. It reads only
-what is on disk, so a resumed run cannot differ from an unbroken one.
+A stage is a plain function of a Run that returns the facts it found (JSON-able), which `run.json` keeps; the fact
+"files", where there is one, lists what it wrote beyond its artefacts. A stage reads only what is on disk, so a resumed
+run cannot differ from an unbroken one.
 """
 
+import contextlib
 import csv
 import io
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 
 from taichi_edges.artefacts import replacing, write_json, write_text
+from taichi_edges.edges.branches import separate_branches
 from taichi_edges.edges.clustering import grow_clusters
 from taichi_edges.edges.edge_set import read_edges, write_edges
 from taichi_edges.edges.filtering import filter_points
 from taichi_edges.edges.fitting import fit_clusters
-from taichi_edges.errors import UserError
+from taichi_edges.edges.segmentation import split_clusters
+from taichi_edges.errors import UserError, did_you_mean
+from taichi_edges.support import line_width
 from taichi_edges.views import read_views, write_views
 
 
@@ -31,8 +36,19 @@ def prepare(run):
 
     folder = run.data_path(source.path, "source.path")
     views = build_views(READERS[source.reader](folder, source), source, run.config.box, run.progress)
+    views, facts = _with_thin_lines(views, source, run.config.train.edge_threshold)
     write_views(run.path("views.npz"), views)
-    return {"views": len(views), "width_px": views.width, "height_px": views.height}
+    return {"views": len(views), "width_px": views.width, "height_px": views.height, **facts}
+
+
+def _with_thin_lines(views, source, edge_threshold):
+    """The views with their edge maps thinned, if the scene wants that, and the width the lines had before."""
+    from taichi_edges.detectors.ridges import thin_edge_maps
+
+    width, _ = line_width(views, edge_threshold)
+    if source.thin:
+        views = replace(views, edge_maps=thin_edge_maps(views.edge_maps, width, source.thin_threshold))
+    return views, {"line_width_px": round(width, 2)}
 
 
 def _prepare_synthetic(run):
@@ -44,17 +60,24 @@ def _prepare_synthetic(run):
     from taichi_edges.synthetic.rendering import render_views
 
     source = run.config.source
+    if source.part not in PARTS:
+        hint = did_you_mean(source.part, PARTS) or f"; there is {', '.join(PARTS)}"
+        raise UserError(f"source.part: there is no part '{source.part}'{hint}")
     part = PARTS[source.part]()
     generator = np.random.default_rng(run.config.seed)
     views, pictures = render_views(part, source.views, source.size, Imperfections(), generator)
-    paths = [run.path("images") / f"{name}.png" for name in views.names]
-    for path, picture in zip(paths, pictures, strict=True):
-        with replacing(path) as unfinished:
-            cv2.imwrite(str(unfinished), picture[:, :, ::-1])
-    views = type(views)(**{**vars(views), "image_paths": tuple(str(path) for path in paths)})
+    files = [f"images/{name}.png" for name in views.names]
+    for stale in run.path("images").glob("*.png"):
+        stale.unlink()
+    for file, picture in zip(files, pictures, strict=True):
+        with replacing(run.path(file)) as unfinished:
+            unfinished.write_bytes(cv2.imencode(".png", picture[:, :, ::-1])[1])
+    views, facts = _with_thin_lines(views, source, run.config.train.edge_threshold)
+    views = replace(views, image_paths=tuple(files))
     write_edges(run.path("truth.json"), part.edges, {"part": part.name})
     write_views(run.path("views.npz"), views)
-    return {"views": len(views), "width_px": views.width, "height_px": views.height, "part": part.name}
+    size = {"width_px": views.width, "height_px": views.height}
+    return {"views": len(views), **size, **facts, "part": part.name, "files": ["truth.json", *files]}
 
 
 def train(run):
@@ -65,8 +88,11 @@ def train(run):
     from taichi_edges.splatting.training import Training, start_taichi
 
     config, views = run.config.train, read_views(run.path("views.npz"))
+    if config.seeds == "points":
+        raise UserError(f"train.seeds: the {run.config.source.reader} reader brings no points; set it to random")
     generator = np.random.default_rng(run.config.seed)
-    start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)
+    with contextlib.redirect_stdout(io.StringIO()):  # ti.init announces itself with a bare print
+        start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)
     points = random_points(config.gaussians, views.box, generator)
     start = start_gaussians(points, generator, config.initial_scale, config.initial_opacity)
     training = Training(views, config, generator, run.threads, run.arch)
@@ -82,7 +108,8 @@ def train(run):
         gaussians.quaternions,
         gaussians.opacity_logits,
     )
-    return {"gaussians": len(gaussians), "view_steps": training.step, "final_loss": records[-1].loss}
+    loss = records[-1].loss if np.isfinite(records[-1].loss) else None  # an epoch may have measured none
+    return {"gaussians": len(gaussians), "view_steps": training.step, "final_loss": loss}
 
 
 def _write_csv(path, rows):
@@ -105,20 +132,22 @@ def cluster(run):
         means, gaussians.directions(), gaussians.opacities, views, run.config.filter, threshold
     )
     if len(points) == 0:
-        raise UserError(
-            f"{run.path('gaussians.ply')}: none of {len(means)} Gaussians passed the filters ({_in_words(asdict(counts))}); "
-            "train longer, or lower filter.min_opacity or filter.min_support"
-        )
+        problem = f"none of {len(means)} Gaussians passed the filters ({_in_words(asdict(counts))})"
+        cure = "train longer, or lower filter.min_opacity or filter.min_support"
+        raise UserError(f"{run.path('gaussians.ply')}: {problem}; {cure}")
     labels = grow_clusters(points, directions, run.config.cluster)
+    labels = separate_branches(points, labels, run.config.cluster.min_points)
+    labels = split_clusters(points, labels, run.config.cluster.min_points)
     write_oriented_points(run.path("points.ply"), views.similarity.to_input(points), directions, labels)
     with replacing(run.path("clusters.npz")) as unfinished, open(unfinished, "wb") as file:
         np.savez_compressed(file, points=points, directions=directions, labels=labels)
-    return {**asdict(counts), "points": len(points), "clusters": int(labels.max() + 1), "unclustered": int((labels < 0).sum())}
+    found = {"points": len(points), "clusters": int(labels.max() + 1), "unclustered": int((labels < 0).sum())}
+    return {**asdict(counts), **found}
 
 
 def _in_words(counts):
-    """'5 low opacity, 3 outliers' from a dict of counts."""
-    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
+    """'5 low opacity, 3 outliers' from a dict of counts, without those that are zero and the number of all."""
+    return ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in counts.items() if n and name != "gaussians")
 
 
 def fit(run):
@@ -131,7 +160,8 @@ def fit(run):
     write_edges(run.path("edges.json"), edges.transformed(views.similarity.to_input), about)
     if len(edges) == 0:
         run.progress.warn(f"no edge was found in {sum(clusters.values())} clusters; see the counts in run.json")
-    return {"lines": len(edges.lines), "curves": len(edges.curves), **{f"{kind}_clusters": n for kind, n in clusters.items()}}
+    kinds = {f"{kind}_clusters": count for kind, count in clusters.items()}
+    return {"lines": len(edges.lines), "curves": len(edges.curves), **kinds}
 
 
 def truth_path(run):
@@ -167,6 +197,8 @@ def export(run):
 
     edges, _ = read_edges(run.path("edges.json"))
     views = read_views(run.path("views.npz"))
+    # Pictures of a synthetic scene lie in the run's own folder, and their paths are relative to it.
+    views = replace(views, image_paths=tuple(str(run.path(path)) if path else "" for path in views.image_paths))
     written = []
     for suffix, write in EXPORTERS.items():
         path = run.path(f"edges{suffix}")
@@ -187,10 +219,11 @@ def source_files(run):
     source = run.config.source
     if source.reader == "synthetic":
         return []
-    folder = run.data_path(source.path, "source.path")
-    listing = folder / (f"transforms_{source.split}.json" if source.reader == "nerf" else "meta_data.json")
-    folders = {folder / name for name in (source.edges or source.split, source.images) if name}
-    return [listing, *sorted(path for place in folders if place.is_dir() for path in place.iterdir() if path.is_file())]
+    from taichi_edges.readers import READERS
+
+    frames = READERS[source.reader](run.data_path(source.path, "source.path"), source)
+    paths = [Path(path) for path in (*frames.edge_paths, *frames.image_paths) if path]
+    return [frames.where, *sorted({path for path in paths if path.is_file()})]
 
 
 def truth_files(run):
@@ -204,6 +237,7 @@ def truth_files(run):
 def read_facts(path):
     """A JSON artefact as a dict; {} where it is not there or damaged (then the stage runs again)."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
+    return content if isinstance(content, dict) else {}

@@ -95,10 +95,42 @@ def read_edges(path):
     try:
         with open(path, encoding="utf-8") as file:
             content = json.load(file)
-        edges = EdgeSet.of(content.pop("lines_end_pts"), content.pop("curves_ctl_pts"))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path}: not an edge file ({error}); it needs curves_ctl_pts and lines_end_pts") from error
-    if "line_sources" in content:
-        sources = [np.asarray(content.pop(key), dtype=np.int64) for key in ("line_sources", "curve_sources")]
-        edges = EdgeSet(edges.lines, edges.curves, *sources)
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror}; an edge file is what the fit stage writes") from error
+    except ValueError as error:
+        raise UserError(f"{path}: not an edge file, it cannot be read as JSON ({error})") from error
+    if not isinstance(content, dict) or not {"lines_end_pts", "curves_ctl_pts"} <= set(content):
+        raise UserError(f"{path}: not an edge file; it needs the keys curves_ctl_pts and lines_end_pts")
+    lines, curves = _points(path, content, "lines_end_pts", 2), _points(path, content, "curves_ctl_pts", 4)
+    edges = EdgeSet.of(lines, curves)
+    found = [key for key in ("line_sources", "curve_sources") if key in content]
+    if len(found) == 1:
+        raise UserError(f"{path}: it has {found[0]} alone; give both line_sources and curve_sources, or neither")
+    if found:
+        line_sources = _sources(path, content, "line_sources", len(lines))
+        edges = EdgeSet(edges.lines, edges.curves, line_sources, _sources(path, content, "curve_sources", len(curves)))
     return edges, content
+
+
+def _points(path, content, key, count):
+    """Takes the (n, count, 3) points of every edge out of an edge file's content."""
+    values = content.pop(key)
+    try:
+        points = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{path}: {key} must hold {count} points (x, y, z) for every edge") from error
+    if points.size and points.shape[1:] != (count, 3):
+        shape = " x ".join(map(str, points.shape))
+        raise UserError(f"{path}: {key} must hold {count} points (x, y, z) for every edge, but it is {shape}")
+    return points.reshape(-1, count, 3)
+
+
+def _sources(path, content, key, count):
+    """Takes the cluster numbers of `count` edges out of an edge file's content."""
+    values = content.pop(key)
+    if not isinstance(values, list) or not all(type(value) is int for value in values):
+        raise UserError(f"{path}: {key} must be a list of whole numbers, one for every edge")
+    if len(values) != count:
+        problem = f"{key} and the edges do not match: {len(values)} and {count}"
+        raise UserError(f"{path}: {problem}; give one for every edge, or remove line_sources and curve_sources")
+    return np.array(values, dtype=np.int64)

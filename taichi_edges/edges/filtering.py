@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taichi_edges.support import exclusive_support
+
 
 @dataclass(frozen=True)
 class FilterCounts:
@@ -20,13 +22,15 @@ def filter_points(means, directions, opacities, views, config, edge_threshold):
 
     means: (n, 3) unit cube. directions: (n, 3) unit vectors. opacities: (n,). config: the scene's `filter` section.
     Support counts, among the views that have the point in front of the camera (z > 0) and inside the image, those in
-    which it falls on an edge pixel; that an edge is hidden in many views is why the share asked for is small.
+    which it falls on an edge pixel that is not explained by a better point elsewhere (`exclusive_support`); that an
+    edge is hidden in many views is why the share asked for is small.
     Returns points (m, 3) float64, directions (m, 3) float64 and FilterCounts.
     """
     points = np.asarray(means, dtype=np.float64)
     opaque = np.asarray(opacities) >= config.min_opacity
-    on_edge, seen = views.edge_support(points, edge_threshold)
-    supported = opaque & (on_edge >= config.min_support * np.maximum(seen, 1)) & (on_edge > 0)
+    supported = opaque.copy()
+    support = exclusive_support(views, points[opaque], edge_threshold)
+    supported[opaque] = (support >= config.min_support) & (support > 0)
     kept = np.flatnonzero(supported)
     inliers = kept[statistical_inliers(points[kept], config.outlier_neighbors, config.outlier_deviations)]
     counts = FilterCounts(

@@ -13,6 +13,9 @@ from taichi_edges.edges.ordering import order_points
 ROBUST_ROUNDS = 10
 REPARAMETRIZATIONS = 4
 TURN_PER_CUBIC = np.radians(100.0)  # one cubic follows a circular arc of 90 degrees to 3e-4 of the radius
+POINTS_PER_PIECE = 6  # at least
+WORTH_A_PIECE = 0.8  # another piece must bring the mean distance down to this share; noise alone brings it to 0.9
+ROUNDING = 1e-9  # unit-cube units: points that are exactly in a row are a line, whatever the last digits say
 END_QUANTILE = 0.01  # of the points along a line: its ends, so that one stray point does not lengthen it
 BENDING = 1e-3  # penalty on second differences of the control points, relative to the data
 CURVE_SAMPLES = 128  # for each cubic, where distances to a curve are measured
@@ -58,7 +61,7 @@ def fit_cluster(points, config):
         ordering = order_points(points)
         curves, curve_error = fit_curve(points, ordering, config.line_tolerance)
         long_enough = np.linalg.norm(np.diff(evaluate_bezier(curves, [0, 0.5, 1]), axis=1), axis=2).sum()
-        if curve_error <= config.delta * line_error and long_enough >= config.min_length:
+        if curve_error + ROUNDING <= config.delta * line_error and long_enough >= config.min_length:
             return Fit("loop" if ordering.closed else "curve", curves=curves)
     if np.linalg.norm(line[1] - line[0]) < config.min_length:
         return Fit("short")
@@ -81,19 +84,34 @@ def fit_line(points, tolerance):
         weights = 1.0 / (1.0 + (distances / tolerance) ** 2) ** 2
     inliers = along[weights >= 0.25] if (weights >= 0.25).sum() >= 2 else along
     ends = np.quantile(inliers, [END_QUANTILE, 1 - END_QUANTILE]) if len(inliers) > 2 else np.sort(inliers)
+    if len(inliers) > 2:  # along an edge the points lie evenly: what the quantiles leave out at each end is known
+        ends += np.array([-1, 1]) * np.ptp(ends) * END_QUANTILE / (1 - 2 * END_QUANTILE)
+        ends = np.clip(ends, inliers.min(), inliers.max())
     return centre + ends[:, None] * direction, float(distances.mean())
 
 
 def fit_curve(points, ordering, tolerance):
     """Chain of cubic Beziers through (n, 3) points by robust least squares over the arc-length parameter.
 
-    The chain is a cubic B-spline (hence smooth at its joints), cut into its Bezier pieces; as many pieces as the
-    points' total turning asks for. Returns control points (m, 4, 3) and the mean distance of all points to the chain.
+    The chain is a cubic spline with a continuous tangent, cut into its Bezier pieces; as many pieces as the points'
+    total turning asks for, and one more while that pays. (Continuous curvature as well would need twice the pieces to
+    follow a circle.) Returns control points (m, 4, 3) and the mean distance of all points to the chain.
     """
+    turning = 2 * np.pi if ordering.closed else total_turning(points, ordering.arc)
+    most = max(len(points) // POINTS_PER_PIECE, 1)
+    pieces = min(max(int(np.ceil(turning / TURN_PER_CUBIC)), 4 if ordering.closed else 1), most)
+    curves, error = _fit_chain(points, ordering, tolerance, pieces)
+    for pieces in range(pieces + 1, most + 1):
+        more, smaller_error = _fit_chain(points, ordering, tolerance, pieces)
+        if smaller_error > WORTH_A_PIECE * error:
+            break
+        curves, error = more, smaller_error
+    return curves, error
+
+
+def _fit_chain(points, ordering, tolerance, pieces):
+    """`fit_curve` with a given number of pieces."""
     arc, length, closed = ordering.arc, ordering.length, ordering.closed
-    turning = 2 * np.pi if closed else total_turning(points, arc)
-    pieces = max(int(np.ceil(turning / TURN_PER_CUBIC)), 4 if closed else 1)
-    pieces = min(pieces, max(len(points) // 6, 1))
     weights = np.ones(len(points))
     for _ in range(REPARAMETRIZATIONS):
         curves = _fit_spline(points, arc / length, weights, pieces, closed)
@@ -141,7 +159,7 @@ def _hermite_to_bezier(values, derivatives, spans):
 
 def _lsq_spline(parameters, points, weights, knots):
     """Weighted least-squares cubic spline; a faint penalty on bending carries it over knot spans without points."""
-    clamped = np.concatenate([[knots[0]] * 3, knots, [knots[-1]] * 3])
+    clamped = np.concatenate([[knots[0]] * 2, np.repeat(knots, 2), [knots[-1]] * 2])
     inside = np.clip(parameters, knots[0], knots[-1])
     design = BSpline.design_matrix(inside, clamped, 3).toarray() * np.sqrt(weights)[:, None]
     bend = np.diff(np.eye(design.shape[1]), 2, axis=0) * BENDING * np.sqrt(weights.sum())
@@ -151,12 +169,23 @@ def _lsq_spline(parameters, points, weights, knots):
 
 
 def nearest_on_chain(points, curves):
-    """Distances (n,) of points to a chain of cubics, and the chain parameter (piece + t) of the nearest sample."""
+    """Distances (n,) of points to a chain of cubics, and the chain parameters (piece + t) of the nearest places.
+
+    The nearest place is looked for on the chords on both sides of the nearest of CURVE_SAMPLES samples of each cubic.
+    """
     t = np.linspace(0.0, 1.0, CURVE_SAMPLES)
     samples = evaluate_bezier(curves, t).reshape(-1, 3)
     parameters = (np.arange(len(curves))[:, None] + t).ravel()
-    distances, nearest = cKDTree(samples).query(points)
-    return distances, parameters[nearest]
+    nearest = cKDTree(samples).query(points)[1]
+    sides = []
+    for first in (np.maximum(nearest - 1, 0), np.minimum(nearest, len(samples) - 2)):
+        start, chord = samples[first], samples[first + 1] - samples[first]
+        squared = np.maximum((chord**2).sum(axis=1), 1e-300)  # 0 at the joints, where two samples coincide
+        share = np.clip(((points - start) * chord).sum(axis=1) / squared, 0.0, 1.0)
+        reached = parameters[first] + share * (parameters[first + 1] - parameters[first])
+        sides.append((np.linalg.norm(start + share[:, None] * chord - points, axis=1), reached))
+    (before, at_before), (after, at_after) = sides
+    return np.minimum(before, after), np.where(before < after, at_before, at_after)
 
 
 def _reparametrize(arc, parameters, length, closed):

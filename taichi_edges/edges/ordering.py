@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 GRAPH_NEIGHBORS = 8
 REACH = 3.0  # graph edges longer than this many times the longest gap of the spanning tree are shortcuts
-WAIST = (0.4, 0.6)  # of the longest walk: an open edge is one strip here, a closed one two
+WAIST = (0.25, 0.75)  # of the longest walk: an open edge is one strip here, a closed one two
 SPAN = 0.6  # of the waist that a strip reaches through at least
 
 
@@ -24,18 +24,23 @@ class Ordering:
 
 def order_points(points):
     """Order the (n, 3) points of one cluster along their edge, by geodesic distance in their neighbour graph."""
-    graph = _connected_graph(points)
-    start = int(np.argmax(dijkstra(graph, indices=0)))
+    graph = connected_graph(points)
+    start = extremity(graph)
     from_start = dijkstra(graph, indices=start)
     length = float(from_start.max())
-    strips = _two_sides(graph, from_start, length)
+    strips = two_sides(graph, from_start)
     if strips is None:
         return Ordering(from_start, length, False)
     return _unroll(graph, from_start, length, strips)
 
 
-def _connected_graph(points):
-    """Symmetric graph of near neighbours that is connected: the spanning tree is always part of it."""
+def extremity(graph):
+    """The point farthest along the graph from an arbitrary one: an end of an open edge."""
+    return int(np.argmax(dijkstra(graph, indices=0)))
+
+
+def connected_graph(points):
+    """(n, n) sparse, symmetric graph of near neighbours that is connected: the spanning tree is always part of it."""
     count = min(GRAPH_NEIGHBORS + 1, len(points))
     distances, indices = cKDTree(points).query(points, count)
     rows = np.repeat(np.arange(len(points)), count - 1)
@@ -69,17 +74,24 @@ def _bridge(points, graph, labels):
     return graph.tocsr()
 
 
-def _two_sides(graph, from_start, length):
+def two_sides(graph, from_start):
     """The two strips (arrays of indices) of which a closed edge consists at its waist; None for an open edge.
 
-    Each strip must reach through the whole waist: a mere gap in an open edge leaves pieces that share it out.
+    Each strip must reach through the whole waist, since a mere gap in an open edge leaves pieces that share it out; and
+    beyond the start the two must come together again, which the arms of a fork do not.
     """
+    length = from_start.max()
     waist = np.flatnonzero((from_start >= WAIST[0] * length) & (from_start <= WAIST[1] * length))
     pieces, labels = connected_components(graph[waist][:, waist], directed=False)
     strips = [waist[labels == piece] for piece in range(pieces)]
     least = SPAN * (WAIST[1] - WAIST[0]) * length
     strips = [strip for strip in strips if np.ptp(from_start[strip]) >= least]
-    return strips if len(strips) == 2 else None
+    if len(strips) != 2:
+        return None
+    beyond = np.flatnonzero(from_start >= WAIST[0] * length)
+    _, sides = connected_components(graph[beyond][:, beyond], directed=False)
+    meeting = np.isin(beyond, strips[0]), np.isin(beyond, strips[1])
+    return strips if set(sides[meeting[0]]) & set(sides[meeting[1]]) else None
 
 
 def _unroll(graph, from_start, length, strips):

@@ -14,6 +14,8 @@ from taichi_edges.views import Views
 
 ORTHONORMAL_TOLERANCE = 1e-3  # largest deviation of R^T R from the identity; files store six digits or more
 BOX_GRID = 9  # points along each side of the scene box that are looked for in every view
+OFF_CENTRE = 0.25  # of the image's size: a principal point farther from the centre is worth a warning
+MOSTLY_EDGES = 0.5  # share of edge pixels from which on the maps must be black on white
 LEAVE_OUT = "or leave such views out with source.skip"
 # What a whole file ends with; a decoder alone may fill the missing rows of a truncated file with grey.
 END_MARKERS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
@@ -24,9 +26,9 @@ class Frames:
     """Views as a layout describes them.
 
     where: the file that lists them, for messages. names: (V,). edge_paths, image_paths: (V,) paths, an image may be
-    missing. intrinsics: (V, 3, 3), pixel centres at integers, or a function (width, height) -> (3, 3) where they
-    depend on the image size. camera_to_world: (V, 4, 4) as in the file. opengl: are those OpenGL axes?
-    size: (width, height) if the file says so. input_to_truth: (4, 4).
+    missing. intrinsics: (V,) functions (width, height) in pixels -> (3, 3), pixel centres at integers.
+    camera_to_world: (V, 4, 4) as in the file. Both are checked when the views to skip are gone. opengl: are those
+    OpenGL axes? size: (width, height) if the file says so. input_to_truth: (4, 4).
     """
 
     where: Path
@@ -45,19 +47,26 @@ def read_json(path, what):
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise UserError(f"{path}: not found; {what}; check source.path and source.reader") from error
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        near = did_you_mean(path.name, [p.name for p in path.parent.glob("*.json")]) if path.parent.is_dir() else ""
+        raise UserError(f"{path}: not found{near}; {what}; check source.path and source.reader") from error
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror}; {what}; check source.path and source.reader") from error
+    except ValueError as error:
         raise UserError(f"{path}: cannot be read as JSON ({error}); download or export it again") from error
 
 
 def matrix(values, shape, where, key):
     """A numeric array of the given shape from JSON values."""
+    if values is None:
+        raise UserError(f"{where}: {key} is missing; export the cameras again, or name the view in source.skip")
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise UserError(f"{where}: {key} is not a matrix of numbers") from error
     if array.shape != shape:
-        raise UserError(f"{where}: {key} must be a {' x '.join(map(str, shape))} matrix, but its shape is {array.shape}")
+        wanted, found = (" x ".join(map(str, sides)) for sides in (shape, array.shape))
+        problem = f"{key} must be a {wanted} matrix of numbers, but its shape is {found or 'a single number'}"
+        raise UserError(f"{where}: {problem}; correct the file")
     return array
 
 
@@ -74,10 +83,10 @@ def build_views(frames, config, box, progress):
     poses = poses @ OPENGL_TO_OPENCV if opengl else poses
     edge_maps = _read_edge_maps(frames, progress)
     height, width = edge_maps.shape[1:]
-    intrinsics = np.stack([k(width, height) if callable(k) else k for k in frames.intrinsics])
-    _check_intrinsics(frames, intrinsics, width, height)
+    intrinsics = np.stack([intrinsics_for(width, height) for intrinsics_for in frames.intrinsics])
+    _check_intrinsics(frames, intrinsics, width, height, progress)
+    _check_box_seen(frames, intrinsics, poses, np.asarray(box, dtype=np.float64), (width, height), opengl)
     world_to_camera = invert_pose(poses)
-    _check_box_seen(frames, intrinsics, world_to_camera, np.asarray(box, dtype=np.float64), (width, height), opengl)
     similarity = Similarity.of_box(box)
     return Views(
         names=tuple(frames.names),
@@ -109,7 +118,7 @@ def _without_skipped(frames, skip):
             raise UserError(f"source.skip: {frames.where} has no view '{name}'{did_you_mean(name, frames.names)}")
     keep = [i for i, name in enumerate(frames.names) if name not in skip]
     if not keep:
-        raise UserError(f"{frames.where}: no view is left; it lists {len(frames.names)}, source.skip leaves out {len(skip)}")
+        raise UserError(f"{frames.where}: source.skip leaves out all of its {len(frames.names)} views; shorten it")
     lists = ("names", "edge_paths", "image_paths", "intrinsics", "camera_to_world")
     chosen = {key: [getattr(frames, key)[i] for i in keep] for key in lists}
     return Frames(
@@ -120,7 +129,8 @@ def _without_skipped(frames, skip):
 def _check_names(frames):
     twice = {name for name in frames.names if frames.names.count(name) > 1}
     if twice:
-        raise UserError(f"{frames.where}: listed more than once: {name_some(sorted(twice))}; every view needs a name of its own")
+        problem = f"listed more than once: {name_some(sorted(twice))}"
+        raise UserError(f"{frames.where}: {problem}; every view needs a name of its own")
 
 
 def _check_poses(frames, poses):
@@ -130,11 +140,15 @@ def _check_poses(frames, poses):
     rotations = poses[:, :3, :3]
     gram = np.swapaxes(rotations, 1, 2) @ rotations
     crooked = np.abs(gram - np.eye(3)).max(axis=(1, 2)) > ORTHONORMAL_TOLERANCE
-    hint = "divide a scale out of the rotation" if np.allclose(gram[0] / gram[0, 0, 0], np.eye(3), atol=1e-3) else "export the poses again"
-    _refuse(frames, crooked, f"the rotation of the pose is not orthonormal; {hint}, {LEAVE_OUT}")
-    _refuse(frames, np.linalg.det(rotations) < 0, f"the rotation of the pose is a mirror (determinant -1); {LEAVE_OUT}")
+    squares = np.trace(gram, axis1=1, axis2=2)[:, None, None] / 3  # of the scale, where there is nothing but a scale
+    scaled = (np.abs(gram - squares * np.eye(3)) < ORTHONORMAL_TOLERANCE * squares).all(axis=(1, 2))
+    cure = "divide the scale out of it" if scaled[crooked].all() else "export the poses again"
+    _refuse(frames, crooked, f"the rotation of the pose is not orthonormal; {cure}, {LEAVE_OUT}")
+    problem = "the rotation of the pose is a mirror (determinant -1); export the poses with right-handed axes"
+    _refuse(frames, np.linalg.det(rotations) < 0, f"{problem}, {LEAVE_OUT}")
     last = np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1) > ORTHONORMAL_TOLERANCE
-    _refuse(frames, last, f"the last row of the pose is not 0 0 0 1; is the matrix transposed? {LEAVE_OUT}")
+    problem = "the last row of the pose is not 0 0 0 1 (is it transposed?)"
+    _refuse(frames, last, f"{problem}; export the poses again, {LEAVE_OUT}")
 
 
 def _refuse(frames, bad, problem):
@@ -144,15 +158,22 @@ def _refuse(frames, bad, problem):
         raise UserError(f"{frames.where}: {len(names)} of {len(bad)} views ({name_some(names)}): {problem}")
 
 
-def _check_intrinsics(frames, intrinsics, width, height):
+def _check_intrinsics(frames, intrinsics, width, height, progress):
     focal = intrinsics[:, [0, 1], [0, 1]]
     bad = ~np.isfinite(intrinsics).all(axis=(1, 2)) | (focal <= 0).any(axis=1)
     _refuse(frames, bad, f"the focal length is not a positive number; correct the intrinsics, {LEAVE_OUT}")
+    lower = np.abs(intrinsics[:, [1, 2, 2, 2], [0, 0, 1, 2]] - [0, 0, 0, 1]).max(axis=1) > 1e-9
+    _refuse(frames, lower, f"the intrinsics must read fx 0 cx, 0 fy cy, 0 0 1 row by row; correct them, {LEAVE_OUT}")
     skewed = np.abs(intrinsics[:, 0, 1]) > 1e-6 * focal[:, 0]
     _refuse(frames, skewed, "the intrinsics have skew, which is not supported; rectify the images")
     outside = (intrinsics[:, :2, 2] < 0).any(axis=1) | (intrinsics[:, :2, 2] > [width, height]).any(axis=1)
-    problem = f"the principal point is outside the {width}x{height} image; were the images resized after calibration? {LEAVE_OUT}"
-    _refuse(frames, outside, problem)
+    problem = f"the principal point is outside the {width} x {height} px image (resized after calibration?)"
+    _refuse(frames, outside, f"{problem}; correct the intrinsics, {LEAVE_OUT}")
+    off_centre = np.abs((intrinsics[:, :2, 2] + 0.5) / [width, height] - 0.5).max(axis=1) > OFF_CENTRE
+    if off_centre.any():
+        names = name_some([name for name, is_off in zip(frames.names, off_centre, strict=True) if is_off])
+        what = f"the principal point is far from the centre of the {width} x {height} px image"
+        progress.warn(f"{off_centre.sum()} of {len(off_centre)} views: {what} (resized after calibration?): {names}")
 
 
 def _read_edge_maps(frames, progress):
@@ -160,24 +181,32 @@ def _read_edge_maps(frames, progress):
     paths = [Path(path) for path in frames.edge_paths]
     missing = np.array([not path.is_file() for path in paths])
     if missing.all():
-        raise UserError(f"{paths[0].parent}: no edge map found here; check source.edges ({frames.where.parent} has: {_folders(frames)})")
-    _refuse(frames, missing, f"the edge map is missing ({paths[int(missing.argmax())]}); run the detector on it, {LEAVE_OUT}")
+        folders = f"{frames.where.parent} has: {_folders(frames)}"
+        raise UserError(f"{paths[0].parent}: no edge map found here; check source.edges ({folders})")
+    problem = f"the edge map is missing ({paths[int(missing.argmax())]})"
+    _refuse(frames, missing, f"{problem}; run the detector on it, {LEAVE_OUT}")
     with ThreadPoolExecutor() as pool:
         maps = list(pool.map(read_grey, paths))
     broken = np.array([edge_map is None for edge_map in maps])
-    _refuse(frames, broken, f"the edge map is truncated or not an image ({paths[int(broken.argmax())]}); write it again, {LEAVE_OUT}")
+    problem = f"the edge map is truncated or not an 8- or 16-bit image ({paths[int(broken.argmax())]})"
+    _refuse(frames, broken, f"{problem}; write it again, {LEAVE_OUT}")
     sizes = [(edge_map.shape[1], edge_map.shape[0]) for edge_map in maps]
     size = frames.size or max(set(sizes), key=sizes.count)
     wrong = np.array([s != size for s in sizes])
     if wrong.any():
         width, height = sizes[int(wrong.argmax())]
-        expected = f"{frames.where.name} says" if frames.size else "most are"
-        problem = f"the edge map is {width}x{height}, but {expected} {size[0]}x{size[1]}; write it in that size, {LEAVE_OUT}"
-        _refuse(frames, wrong, problem)
+        expected = f"{frames.where.name} says" if frames.size else "the others are"
+        problem = f"the edge map is {width} x {height} px, but {expected} {size[0]} x {size[1]} px"
+        _refuse(frames, wrong, f"{problem}; write it in that size, {LEAVE_OUT}")
     maps = np.stack(maps)
     empty = ~(maps >= 128).any(axis=(1, 2))
     if empty.all():
-        raise UserError(f"{paths[0].parent}: no edge map has an edge pixel (a value of 128 or more); are these the detector's outputs?")
+        problem = "no edge map has an edge pixel, a value of 128 or more; scale the maps to 0..255"
+        raise UserError(f"{paths[0].parent}: {problem}, or check source.edges")
+    share = float((maps >= 128).mean())
+    if share > MOSTLY_EDGES:
+        problem = f"{100 * share:.0f} % of all pixels are edge pixels; edges must be white on black: invert the maps"
+        raise UserError(f"{paths[0].parent}: {problem}, or check source.edges")
     if empty.any():
         names = [name for name, is_empty in zip(frames.names, empty, strict=True) if is_empty]
         progress.warn(f"{len(names)} of {len(maps)} edge maps have no edge pixel and teach nothing: {name_some(names)}")
@@ -191,9 +220,7 @@ def _folders(frames):
 
 def is_whole(path):
     """Does the file end as a whole file of its kind ends? Formats without a known end marker pass."""
-    marker = END_MARKERS.get(path.suffix.lower())
-    with open(path, "rb") as file:
-        content = file.read()
+    marker, content = END_MARKERS.get(path.suffix.lower()), path.read_bytes()
     return bool(content) and (marker is None or marker in content[-64:])
 
 
@@ -225,18 +252,30 @@ def _usable_images(frames, progress):
     return [str(path) if ok else "" for path, ok in zip(wanted, usable, strict=True)]
 
 
-def _check_box_seen(frames, intrinsics, world_to_camera, box, size, opengl):
+def _check_box_seen(frames, intrinsics, poses, box, size, opengl):
     """Every view must have some of the scene box in front of it and inside the image."""
+    seeing = _views_that_see(box, intrinsics, invert_pose(poses), size)
+    corners = " to ".join("(" + ", ".join(f"{x:g}" for x in corner) + ")" for corner in box)
+    if not seeing.any():
+        used, other = ("OpenGL", "opencv") if opengl else ("OpenCV", "opengl")
+        centre = "(" + ", ".join(f"{x:.3g}" for x in poses[:, :3, 3].mean(axis=0)) + ")"
+        flipped = poses @ OPENGL_TO_OPENCV
+        inverted = OPENGL_TO_OPENCV @ flipped if opengl else poses  # what the file holds, taken for world-to-camera
+        seeing_flipped = _views_that_see(box, intrinsics, invert_pose(flipped), size).sum()
+        seeing_inverted = _views_that_see(box, intrinsics, inverted[:, :3], size).sum()
+        if seeing_inverted > seeing_flipped:
+            cure = "the poses seem to be world-to-camera; this layout has camera-to-world"
+        elif seeing_flipped:
+            cure = f"the poses were read with {used} axes; set source.axes: {other}"
+        else:
+            cure = f"correct the box (the cameras are around {centre}) or source.axes, now {used}"
+        raise UserError(f"{frames.where}: 0 of {len(seeing)} views see the scene box {corners}: {cure}")
+    _refuse(frames, ~seeing, f"the scene box {corners} is not in sight; correct the box or the pose, {LEAVE_OUT}")
+
+
+def _views_that_see(box, intrinsics, world_to_camera, size):
+    """(V,) bool: which views have at least one point of a grid through the (2, 3) box inside the image."""
     axes = [np.linspace(low, high, BOX_GRID) for low, high in zip(*box, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    blind = np.array(
-        [not inside_image(project(grid, k, pose)[0], *size).any() for k, pose in zip(intrinsics, world_to_camera, strict=True)]
-    )
-    corners = " to ".join("(" + ", ".join(f"{x:g}" for x in corner) + ")" for corner in box)
-    if blind.all():
-        used, other = ("OpenGL", "opencv") if opengl else ("OpenCV", "opengl")
-        raise UserError(
-            f"{frames.where}: 0 of {len(blind)} views see the scene box {corners}: read with {used} axes; "
-            f"set source.axes: {other}, or correct the box"
-        )
-    _refuse(frames, blind, f"they do not see the scene box {corners}; correct the box, {LEAVE_OUT}")
+    cameras = zip(intrinsics, world_to_camera, strict=True)
+    return np.array([inside_image(project(grid, lens, pose)[0], *size).any() for lens, pose in cameras])

@@ -4,6 +4,7 @@ Intrinsics are per frame (`camera_intrinsics`, 3x3, pixel centres at integers) o
 horizontal field of view in radians; then the principal point is the image's centre, (size - 1) / 2.
 """
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,9 @@ def read_nerf(folder, config):
         names=[path.stem for path in paths],
         edge_paths=[folder / (config.edges or path.parent) / path.name for path in paths],
         image_paths=[folder / config.images / path.name if config.images else "" for path in paths],
-        intrinsics=[_intrinsics(frame, content, path.stem, where) for frame, path in zip(frames, paths, strict=True)],
+        intrinsics=[
+            partial(_intrinsics, frame, content, path.stem, where) for frame, path in zip(frames, paths, strict=True)
+        ],
         camera_to_world=[frame.get("transform_matrix") for frame in frames],
         opengl=True,
     )
@@ -36,18 +39,19 @@ def _file_path(frame, where):
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
         raise UserError(f"{where}: a frame without file_path; every frame names its image")
     path = Path(frame["file_path"])
+    if not path.name:
+        raise UserError(f"{where}: a frame with the file_path '{path}'; every frame names its image")
     return path if path.suffix.lower() in (".png", ".jpg", ".jpeg") else path.with_name(path.name + ".png")
 
 
-def _intrinsics(frame, content, name, where):
+def _intrinsics(frame, content, name, where, width, height):
+    """(3, 3): the frame's own, or those that the field of view means for an image of this size."""
     if "camera_intrinsics" in frame:
         return matrix(frame["camera_intrinsics"], (3, 3), where, f"camera_intrinsics of {name}")
     angle = frame.get("camera_angle_x", content.get("camera_angle_x"))
-    if not isinstance(angle, (int, float)) or not 0 < angle < np.pi:
-        raise UserError(f"{where}: {name} has neither camera_intrinsics nor a camera_angle_x between 0 and pi radians")
-
-    def from_angle(width, height):
-        focal = 0.5 * width / np.tan(0.5 * angle)
-        return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
-
-    return from_angle
+    if angle is None:
+        raise UserError(f"{where}: {name} has neither camera_intrinsics nor camera_angle_x; add one of them")
+    if type(angle) not in (int, float) or not 0 < angle < np.pi:
+        raise UserError(f"{where}: camera_angle_x of {name} must be between 0 and pi radians, not {angle}")
+    focal = 0.5 * width / np.tan(0.5 * angle)
+    return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from taichi_edges.splatting.gaussians import Gaussians
+from taichi_edges.support import exclusive_support
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,9 @@ def cull_opacity(population, minimum):
 
 
 def cull_support(population, views, minimum, threshold):
-    """Those whose centre falls on an edge pixel in at least this share of the views that have it in the image."""
-    on_edge, seen = views.edge_support(population.gaussians.means.astype(np.float64), threshold)
-    return population.keep(on_edge >= minimum * np.maximum(seen, 1))
+    """Those that the edge maps support in at least this share of the views, shared support not counted twice."""
+    means = population.gaussians.means.astype(np.float64)
+    return population.keep(exclusive_support(views, means, threshold) >= minimum)
 
 
 def duplicate(population, share, copies, distance, maximum, generator):

@@ -95,11 +95,11 @@ class Splatter:
         background = min(edges, pixel_count - edges)
         if self.loss_mode == "balanced":
             selection.count = edges + background
-            if edges:
-                arguments = (images.maps, images.words, images.pixels, selection.mask, selection.planes)
-                place = (int(images.starts[view]), edges, background, int(seed))
-                self._select_balanced(view, *arguments, *place, 1.0 / selection.count)
-            return selection.count if edges else 0
+            arguments = (images.maps, images.words, images.pixels, selection.mask, selection.planes)
+            place = (int(images.starts[view]), edges, background, int(seed))
+            # Also for no pixels: it empties the mask, or the adjoint would visit the pixels of the view before.
+            self._select_balanced(view, *arguments, *place, 1.0 / max(selection.count, 1))
+            return selection.count
         weights = (1.0 / pixel_count, 1.0 / pixel_count)
         if self.loss_mode == "class_weighted":
             weights = (0.5 / max(edges, 1), 0.5 / max(pixel_count - edges, 1))

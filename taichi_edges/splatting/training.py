@@ -160,7 +160,8 @@ class Training:
         return density.duplicate(population, share, copies, distance, maximum, self.generator)
 
     def _cull_support(self, population):
-        population = density.cull_support(population, self.views, self.config.density.min_support, self.config.edge_threshold)
+        config, threshold = self.config.density, self.config.edge_threshold
+        population = density.cull_support(population, self.views, config.min_support, threshold)
         return self._limit_opacity(population)
 
     def _cull_opacity(self, population):

@@ -1,0 +1,69 @@
+"""What each stage has found, in one line for the person who waits. `FINDINGS[stage](facts)` makes it."""
+
+
+def amount(count, noun, plural=None):
+    """'1 line', '2 lines', '3 more boxes'."""
+    return f"{count} {noun if count == 1 else plural or noun + 's'}"
+
+
+def left_out(*amounts):
+    """'; left out: 3 outliers, 1 point': the (count, noun, plural) that are not zero, '' where all are."""
+    named = [amount(*each) for each in amounts if each[0]]
+    return f"; left out: {', '.join(named)}" if named else ""
+
+
+def describe_prepare(facts):
+    """'12 views of 128 x 128 px'."""
+    part = f" of the synthetic part '{facts['part']}'" if "part" in facts else ""
+    return f"{amount(facts['views'], 'view')}{part}, {facts['width_px']} x {facts['height_px']} px"
+
+
+def describe_train(facts):
+    """'875 Gaussians after 720 view steps, final loss 0.1398'."""
+    loss = "" if facts["final_loss"] is None else f", final loss {facts['final_loss']:.4f}"
+    return f"{amount(facts['gaussians'], 'Gaussian')} after {amount(facts['view_steps'], 'view step')}{loss}"
+
+
+def describe_cluster(facts):
+    """'823 points in 40 clusters; left out: 40 Gaussians of low support, 12 points in clusters that are too small'."""
+    clustered = facts["points"] - facts["unclustered"]
+    return f"{amount(clustered, 'point')} in {amount(facts['clusters'], 'cluster')}" + left_out(
+        (facts["low_opacity"], "Gaussian of low opacity", "Gaussians of low opacity"),
+        (facts["low_support"], "Gaussian of low support", "Gaussians of low support"),
+        (facts["outliers"], "outlier"),
+        (facts["unclustered"], "point in a cluster that is too small", "points in clusters that are too small"),
+    )
+
+
+def describe_fit(facts):
+    """'19 lines and 21 curves (2 of the edges closed); left out: 3 clusters that are too short'."""
+    closed = facts["loop_clusters"]
+    loops = f" ({closed} closed {'edge' if closed == 1 else 'edges'})" if closed else ""
+    return f"{amount(facts['lines'], 'line')} and {amount(facts['curves'], 'curve')}{loops}" + left_out(
+        (facts["short_clusters"], "cluster that is too short", "clusters that are too short"),
+        (facts["degenerate_clusters"], "cluster without extent", "clusters without extent"),
+    )
+
+
+def describe_evaluate(facts):
+    """'F-score 72.6 % at 5 mm, 73.5 % at 10 mm, 74.6 % at 20 mm', or that there is no ground truth."""
+    if facts["ground_truth"] is None:
+        return "no ground truth, so only the edges are counted"
+    shares = [f"{facts[f'f_score_{limit}mm_percent']:.1f} % at {limit} mm" for limit in (5, 10, 20)]
+    return f"F-score {', '.join(shares)}"
+
+
+def describe_export(facts):
+    """'edges.ply, edges.obj, overlays.png and 4 pictures in overlays/'."""
+    files = [name for name in facts["files"] if "/" not in name]
+    return f"{', '.join(files)} and {amount(len(facts['files']) - len(files), 'picture')} in overlays/"
+
+
+FINDINGS = {
+    "prepare": describe_prepare,
+    "train": describe_train,
+    "cluster": describe_cluster,
+    "fit": describe_fit,
+    "evaluate": describe_evaluate,
+    "export": describe_export,
+}

@@ -1,0 +1,544 @@
+"""The corridor from end to end: artefacts, resume, refusals, exit status. A run of the tiny scene takes a few seconds.
+
+Every run is a process of its own, as a user starts it: Taichi holds one program at a time, and a killed process is
+really dead.
+"""
+
+import csv
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from taichi_edges.artefacts import remove_unfinished, replacing
+from taichi_edges.edges.edge_set import read_edges
+from taichi_edges.errors import UserError
+from taichi_edges.findings import FINDINGS
+from taichi_edges.pipeline import STAGES, Run, run_stages
+from taichi_edges.progress import PlainProgress, TerminalProgress
+from taichi_edges.scene import load_scene
+from taichi_edges.views import read_views
+
+ROOT = Path(__file__).parent.parent
+ARTEFACTS = (
+    "views.npz", "gaussians.ply", "train_log.csv", "points.ply", "clusters.npz", "edges.json", "metrics.json", "metrics.csv",
+    "edges.ply", "edges.obj", "overlays.png", "run.json", "scene.yaml", "truth.json",
+)
+SCENE = """
+source: {reader: synthetic, part: block, views: 12, size: 112}
+train:
+  epochs: 40
+  gaussians: 1200
+  only_means_epochs: 15
+  regularize_from_epoch: 30
+  learning_rates: {means: 0.005, scales: 0.001, quaternions: 0.01}
+  density: {duplicate_epochs: [], cull_opacity_epochs: [25], cull_support_epochs: [30]}
+filter: {min_opacity: 0.05}
+cluster: {max_gap: 0.1, min_points: 5}
+fit: {line_tolerance: 0.015}
+"""
+
+# Runs run.py with one function of the stage replaced: it kills the process in the middle of its work.
+KILLER = """
+import os, signal, sys
+sys.path.insert(0, {root!r})
+import run
+from taichi_edges import artefacts, stages
+
+def die(*arguments, **options):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+def write_half(path, *arguments, **options):
+    with artefacts.replacing(path) as unfinished:
+        unfinished.write_bytes(b"half a file")
+        die()
+
+def patch():
+    {patch}
+
+patch()
+sys.exit(run.main({arguments!r}))
+"""
+KILLED_IN = {
+    # after the pictures, while views.npz is being written
+    "prepare": "stages.write_views = write_half",
+    # after a whole training, when gaussians.ply is half written
+    "train": "from taichi_edges.exporters import splats; splats.write_gaussians = write_half",
+    # between points.ply and clusters.npz
+    "cluster": "stages.np.savez_compressed = die",
+    "fit": "stages.write_edges = write_half",
+    # between metrics.json and metrics.csv
+    "evaluate": "stages._write_csv = write_half",
+    "export": "from taichi_edges.exporters import overlays; overlays.contact_sheet = die",
+}
+
+
+def command(scene, out, *arguments):
+    """The command line of a run, without the interpreter and run.py."""
+    return [str(scene), "--out", str(out), "--threads", "2", *map(str, arguments)]
+
+
+def start(arguments, code=None, cwd=ROOT, **environment):
+    """Run run.py (or Python `code`) to its end and return the CompletedProcess, with its output as text."""
+    environment = {**{key: value for key, value in os.environ.items() if key != "TAICHI_EDGES_DATA"}, **environment}
+    head = [sys.executable, "-c", code] if code else [sys.executable, str(ROOT / "run.py")]
+    tail = [] if code else arguments
+    return subprocess.run([*head, *tail], capture_output=True, text=True, cwd=cwd, env=environment, timeout=300)
+
+
+def succeed(arguments, **options):
+    done = start(arguments, **options)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def refuse(arguments, **options):
+    """The text of the single error line of a run that must end with exit status 2."""
+    done = start(arguments, **options)
+    assert done.returncode == 2, (done.returncode, done.stderr)
+    assert "Traceback" not in done.stderr
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1 and done.stderr.splitlines()[-1] == errors[0], done.stderr
+    return errors[0]
+
+
+def contents(folder):
+    """{relative path: bytes} of all files in a folder."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def left_behind(folder):
+    """Temporary files."""
+    return [path.name for path in folder.rglob("*") if "unfinished" in path.name]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """(scene file, folder for --out, CompletedProcess) of an unbroken run. Not to be changed: see `copied`."""
+    folder = tmp_path_factory.mktemp("unbroken")
+    scene = folder / "tiny.yaml"
+    scene.write_text(SCENE)
+    done = succeed(command(scene, folder / "runs"))
+    return scene, folder / "runs", done
+
+
+@pytest.fixture
+def copied(finished, tmp_path):
+    """(scene file, folder for --out, folder of the run) of a copy of the finished run."""
+    scene, runs, _ = finished
+    shutil.copytree(runs, tmp_path / "runs")
+    return scene, tmp_path / "runs", tmp_path / "runs" / "tiny"
+
+
+class Said:
+    """A Progress that keeps what it is told."""
+
+    def __init__(self):
+        self.lines = []
+
+    def say(self, text):
+        self.lines.append(text)
+
+    def warn(self, text):
+        self.lines.append(f"warning: {text}")
+
+    def states(self):
+        """{stage: 'up to date' or 'ran'} by the lines said."""
+        return {
+            line.partition(":")[0]: "up to date" if "up to date" in line else "ran"
+            for line in self.lines
+            if line.partition(":")[0] in STAGES
+        }
+
+
+def rerun(copied, settings=(), stage=None, until=None, threads=2):
+    """Run the copy in this process; good for everything that does not train. Returns the record and what was said."""
+    scene, runs, _ = copied
+    said = Said()
+    config = load_scene(scene, settings=settings)
+    record = run_stages(Run(config, runs / config.name, threads=threads, progress=said), stage, until)
+    return record, said
+
+
+def states(ran, skipped):
+    return {**dict.fromkeys(skipped, "up to date"), **dict.fromkeys(ran, "ran")}
+
+
+# ----------------------------------------------------------------------------------------------------- a whole run
+
+
+def test_all_artefacts_are_there_and_can_be_read(finished):
+    _, runs, _ = finished
+    folder = runs / "tiny"
+    assert {name for name in ARTEFACTS if not (folder / name).is_file()} == set()
+    assert len(list((folder / "overlays").glob("*.png"))) == 4 and len(list((folder / "images").glob("*.png"))) == 12
+    assert len(read_views(folder / "views.npz")) == 12
+    edges, about = read_edges(folder / "edges.json")
+    assert len(edges) > 0 and about["frame"] == "input" and about["seed"] == 0
+    assert (folder / "gaussians.ply").read_bytes().startswith(b"ply\n")
+    log = list(csv.DictReader((folder / "train_log.csv").open()))
+    assert [row["epoch"] for row in log] == [str(epoch) for epoch in range(1, 41)]
+    assert left_behind(folder) == []
+
+
+def test_the_block_is_found(finished):
+    """Twelve lines of 0.9 x 0.7 x 0.5; so few views and epochs find most of them."""
+    _, runs, _ = finished
+    metrics = json.loads((runs / "tiny" / "metrics.json").read_text())
+    assert metrics["true_edges"] == 12 and metrics["recall_20mm_percent"] > 80 and metrics["completeness_mm"] < 20
+
+
+def test_the_record_holds_scene_versions_and_every_stage(finished):
+    _, runs, _ = finished
+    record = json.loads((runs / "tiny" / "run.json").read_text())
+    assert record["scene"]["train"]["epochs"] == 40 and record["scene"]["seed"] == 0
+    assert {"taichi_edges", "taichi", "numpy", "scipy"} <= set(record["versions"])
+    assert list(record["stages"]) == list(STAGES)
+    for stage in record["stages"].values():
+        assert stage["seconds"] >= 0 and stage["peak_memory_mib"] > 10 and stage["fingerprint"]
+        assert all(re.fullmatch("[0-9a-f]{32}", digest) for digest in stage["outputs"].values())
+
+
+def test_the_resolved_scene_loads_again(finished):
+    scene, runs, _ = finished
+    assert load_scene(runs / "tiny" / "scene.yaml") == load_scene(scene)
+
+
+def test_output_is_a_summary_and_the_progress_goes_to_standard_error(finished):
+    _, _, done = finished
+    assert "Taichi" not in done.stdout + done.stderr
+    assert done.stdout.startswith("tiny: metrics\n") and "F-score at 5 mm" in done.stdout
+    assert "results: " in done.stdout and "edges.json, edges.ply, edges.obj, overlays.png" in done.stdout
+    lines = done.stderr.splitlines()
+    assert lines[0] == "prepare ..." and lines[-1].startswith("export: edges.ply, edges.obj, overlays.png and 4 pictures")
+    assert any(re.fullmatch(r"train: \d+ Gaussians after 480 view steps, final loss 0\.\d{4} \(.* s\)", line) for line in lines)
+
+
+def test_every_stage_can_say_what_it_found():
+    assert list(FINDINGS) == list(STAGES)
+    fit = {"lines": 1, "curves": 2, "loop_clusters": 1, "short_clusters": 3, "degenerate_clusters": 0}
+    assert FINDINGS["fit"](fit) == "1 line and 2 curves (1 closed edge); left out: 3 clusters that are too short"
+    assert "no ground truth" in FINDINGS["evaluate"]({"ground_truth": None})
+
+
+# --------------------------------------------------------------------------------------- skipping and running again
+
+
+def test_a_second_run_skips_every_stage_and_changes_nothing(copied):
+    scene, runs, folder = copied
+    before = contents(folder)
+    done = succeed(command(scene, runs))
+    assert contents(folder) == before
+    assert [line.partition(" (")[0] for line in done.stderr.splitlines()] == [f"{name}: up to date" for name in STAGES]
+    assert "(earlier)" in done.stdout
+
+
+def test_quiet_prints_no_progress(copied):
+    scene, runs, _ = copied
+    done = succeed(command(scene, runs, "--quiet", "--set", "fit.delta=0.9"))
+    assert done.stderr == "" and "F-score" in done.stdout
+
+
+def test_changing_the_training_runs_from_train_on(copied):
+    scene, runs, folder = copied
+    before = contents(folder)
+    done = succeed(command(scene, runs, "--set", "train.epochs=3"))
+    assert "prepare: up to date" in done.stderr
+    assert "train again (gaussians.ply: stale: train.epochs was 40, is now 3)" in done.stderr
+    assert "cluster again (points.ply: stale: gaussians.ply has changed)" in done.stderr
+    after = contents(folder)
+    assert after["views.npz"] == before["views.npz"] and after["gaussians.ply"] != before["gaussians.ply"]
+
+
+def test_changing_the_fit_runs_from_fit_on(copied):
+    record, said = rerun(copied, ["fit.delta=0.9", "fit.min_length=0.2"])
+    assert said.states() == states(ran=("fit", "evaluate", "export"), skipped=("prepare", "train", "cluster"))
+    assert record["stages"]["fit"]["inputs"]["settings"]["fit"]["delta"] == 0.9
+    assert rerun(copied, ["fit.delta=0.9", "fit.min_length=0.2"])[1].states() == states((), STAGES)
+
+
+def test_a_stage_whose_inputs_come_out_the_same_is_skipped(copied):
+    """The cluster stage has to run for its changed setting, but its clusters are the same, so fit need not."""
+    _, said = rerun(copied, ["cluster.max_gap=0.100000001"])
+    assert said.states() == states(ran=("cluster",), skipped=("prepare", "train", "fit", "evaluate", "export"))
+
+
+def test_stage_starts_there_and_reuses_what_is_before(copied):
+    _, _, folder = copied
+    gaussians = (folder / "gaussians.ply").stat().st_mtime_ns
+    edges = (folder / "edges.json").read_bytes()
+    record, said = rerun(copied, stage="cluster")
+    assert said.states() == states(ran=("cluster", "fit", "evaluate", "export"), skipped=())
+    assert record["ran"] == ["cluster", "fit", "evaluate", "export"]
+    assert (folder / "gaussians.ply").stat().st_mtime_ns == gaussians
+    assert (folder / "edges.json").read_bytes() == edges
+
+
+def test_until_stops_there(copied):
+    record, said = rerun(copied, ["cluster.max_gap=0.08"], until="cluster")
+    assert set(said.states()) == {"prepare", "train", "cluster"} and record["ran"] == ["cluster"]
+
+
+def test_stage_and_until_name_one_stage(copied):
+    assert rerun(copied, stage="fit", until="fit")[0]["ran"] == ["fit"]
+
+
+@pytest.mark.parametrize("lost", ["edges.obj", "overlays.png", "points.ply", "metrics.csv", "truth.json"])
+def test_a_lost_artefact_is_made_again(copied, lost):
+    _, _, folder = copied
+    before = (folder / lost).read_bytes()
+    (folder / lost).unlink()
+    rerun(copied)
+    assert (folder / lost).read_bytes() == before
+
+
+def test_a_hand_edited_artefact_is_noticed_and_made_again(copied):
+    _, _, folder = copied
+    before = (folder / "edges.json").read_bytes()
+    (folder / "edges.json").write_bytes(before.replace(b'"input"', b'"other"'))
+    _, said = rerun(copied)
+    assert "fit again (edges.json: is not the file that the fit stage wrote)" in said.lines
+    assert (folder / "edges.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"stages": []}', '{"stages": {"train": 3, "fit": {"seconds": 1}}}'])
+def test_a_damaged_record_is_no_obstacle(copied, content):
+    _, _, folder = copied
+    (folder / "run.json").write_text(content)
+    rerun(copied, until="prepare")
+    with pytest.raises(UserError, match="train stage has not finished"):
+        rerun(copied, stage="cluster")
+
+
+# --------------------------------------------------------------------------------------------------------- refusals
+
+
+def refused(copied, **options):
+    with pytest.raises(UserError) as error:
+        rerun(copied, **options)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_starting_after_a_missing_artefact_is_refused(copied):
+    _, _, folder = copied
+    (folder / "gaussians.ply").unlink()
+    message = refused(copied, stage="cluster")
+    assert message == (
+        f"{folder / 'gaussians.ply'}: not there yet, the train stage has not finished; "
+        "run again without --stage, or with --stage train"
+    )
+
+
+def test_starting_after_a_stale_artefact_names_the_key_with_old_and_new_value(copied):
+    message = refused(copied, stage="cluster", settings=["train.learning_rates.means=0.5", "seed=3"])
+    assert "views.npz: stale: seed was 0, is now 3; run again without --stage, or with --stage prepare" in message
+    message = refused(copied, stage="cluster", settings=["train.learning_rates.means=0.5"])
+    assert "gaussians.ply: stale: train.learning_rates.means was 0.005, is now 0.5;" in message
+    assert "points.ply: stale: cluster.theta was 0.8, is now 0.6" in refused(
+        copied, stage="fit", settings=["cluster.theta=0.6"]
+    )
+
+
+def test_other_threads_make_the_training_stale(copied):
+    assert "gaussians.ply: stale: threads was 2, is now 1" in refused(copied, stage="cluster", threads=1)
+
+
+def test_starting_after_a_hand_edited_artefact_is_refused(copied):
+    _, _, folder = copied
+    with open(folder / "gaussians.ply", "ab") as file:
+        file.write(b" ")
+    assert "gaussians.ply: is not the file that the train stage wrote" in refused(copied, stage="cluster")
+
+
+def test_a_refusal_changes_no_artefact(copied):
+    _, _, folder = copied
+    before = {name: content for name, content in contents(folder).items() if name != "scene.yaml"}
+    refused(copied, stage="fit", settings=["cluster.theta=0.6"])
+    assert {name: content for name, content in contents(folder).items() if name != "scene.yaml"} == before
+
+
+def test_stage_after_until_is_refused(copied):
+    assert "--stage fit comes after --until train" in refused(copied, stage="fit", until="train")
+
+
+def test_a_mistyped_truth_is_refused_before_the_training(copied, tmp_path):
+    message = refused(copied, settings=[f"evaluation.truth={tmp_path}/nowhere.ply", "train.epochs=1000000"])
+    assert "evaluation.truth: " in message and "does not exist" in message
+
+
+def test_filters_that_leave_nothing_are_refused_with_counts(copied):
+    message = refused(copied, settings=["filter.min_opacity=1"])
+    assert "Gaussians passed the filters (" in message and "low opacity" in message and "filter.min_opacity" in message
+
+
+def test_an_unknown_part_is_refused(copied):
+    assert "no part 'blok'; did you mean 'block'?" in refused(copied, settings=["source.part=blok"])
+
+
+def test_seeds_that_the_source_does_not_have_are_refused(copied):
+    assert "train.seeds" in refused(copied, settings=["train.seeds=points"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["scenes/nowhere.yaml"], "scenes/nowhere.yaml: No such file or directory"),
+        (["scenes"], "scenes: is a folder"),
+        (["scenes/abc_00000006.yaml"], "give --data FOLDER or set TAICHI_EDGES_DATA"),
+        (["scenes/abc_00000006.yaml", "--data", "run.py"], "--data: run.py is not a folder"),
+        (["scenes/abc_00000006.yaml", "--data", "tests"], "tests/abc_nef/00000006 does not exist"),
+        (["scenes/demo.yaml", "--out", "run.py"], "cannot be written to (Not a directory); choose another folder"),
+        (["scenes/demo.yaml", "--threads", "0"], "--threads 0: must be at least 1"),
+        (["scenes/demo.yaml", "--set", "fit.delat=1"], "--set fit.delat=1: fit.delat: unknown key; did you mean 'delta'?"),
+        (["scenes/demo.yaml", "--show", "--until", "train"], "--show needs the edges"),
+        (["scenes/demo.yaml", "--stage", "fit", "--until", "train"], "--stage fit comes after --until train"),
+    ],
+)
+def test_mistakes_end_with_status_2_and_one_line(tmp_path, arguments, says):
+    out = [] if "--out" in arguments else ["--out", str(tmp_path)]
+    assert says in refuse([*arguments, *out])
+    assert left_behind(tmp_path) == []
+
+
+def test_a_data_root_that_is_no_folder_is_named_by_its_variable(tmp_path):
+    arguments = ["scenes/abc_00000006.yaml", "--out", str(tmp_path)]
+    assert "TAICHI_EDGES_DATA: /nowhere is not a folder" in refuse(arguments, TAICHI_EDGES_DATA="/nowhere")
+
+
+def test_a_device_that_is_not_there_is_refused(copied):
+    scene, runs, _ = copied
+    if shutil.which("nvidia-smi"):
+        pytest.skip("this machine has an NVIDIA driver")
+    message = refuse([str(scene), "--out", str(runs), "--arch", "cuda"])
+    assert "--arch cuda: this machine offers Taichi no cuda device; use --arch cpu" in message
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux tells by a variable that there is no display")
+def test_show_without_a_display_says_what_to_open_instead(copied):
+    scene, runs, _ = copied
+    message = refuse(command(scene, runs, "--show"), DISPLAY="", WAYLAND_DISPLAY="")
+    assert "no display" in message and "edges.ply" in message
+
+
+def test_a_closed_pipe_is_no_error(copied):
+    scene, runs, _ = copied
+    code = (
+        "import subprocess, sys\n"
+        f"run = subprocess.Popen([sys.executable, {str(ROOT / 'run.py')!r}, *{command(scene, runs)!r}], stdout=subprocess.PIPE, "
+        "stderr=subprocess.PIPE)\nrun.stdout.close()\nsys.stderr.write(run.stderr.read().decode())\nsys.exit(run.wait())"
+    )
+    done = start([], code=code)
+    assert done.returncode == 0 and "Traceback" not in done.stderr and "Exception" not in done.stderr
+
+
+# ------------------------------------------------------------------------------------------- kills and repetitions
+
+
+def kill_in(stage, arguments):
+    """Run until the process kills itself in `stage`."""
+    code = KILLER.format(root=str(ROOT), patch=KILLED_IN[stage], arguments=arguments)
+    done = start([], code=code)
+    assert done.returncode == -signal.SIGKILL, (stage, done.returncode, done.stderr)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
+def test_a_run_killed_in_every_stage_and_resumed_each_time_gives_the_same_edges(finished, tmp_path):
+    scene, runs, _ = finished
+    arguments, folder = command(scene, tmp_path), tmp_path / "tiny"
+    unbroken = contents(runs / "tiny")
+    for number, stage in enumerate(STAGES):
+        kill_in(stage, arguments)
+        record = folder / "run.json"
+        done = list(json.loads(record.read_text())["stages"]) if record.exists() else []
+        assert done == list(STAGES)[:number]  # the killed stage does not count as finished
+        for name in [artefact for each in done for artefact in STAGES[each].writes]:
+            if name != "train_log.csv":  # it holds seconds
+                assert (folder / name).read_bytes() == unbroken[name], (stage, name)
+    succeed(arguments)
+    assert (folder / "edges.json").read_bytes() == unbroken["edges.json"]
+    assert (folder / "gaussians.ply").read_bytes() == unbroken["gaussians.ply"]
+    assert left_behind(folder) == []
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
+def test_a_kill_leaves_a_finished_run_of_other_settings_noticed(copied):
+    """Killed while it replaces older artefacts: a mixture of two runs must not pass for either."""
+    scene, runs, folder = copied
+    before = (folder / "edges.json").read_bytes()
+    kill_in("evaluate", command(scene, runs, "--set", "fit.min_length=0.6"))
+    rerun(copied)  # the first settings again
+    assert (folder / "edges.json").read_bytes() == before
+    assert json.loads((folder / "run.json").read_text())["stages"]["fit"]["inputs"]["settings"]["fit"]["min_length"] == 0.01
+
+
+def test_one_seed_gives_the_same_edges_and_another_seed_others(finished, tmp_path):
+    """The killed run above is the second run with one seed; here the prepared views come anew with another."""
+    scene, runs, _ = finished
+    succeed(command(scene, tmp_path, "--seed", "1", "--until", "fit"))
+    other, first = tmp_path / "tiny" / "edges.json", runs / "tiny" / "edges.json"
+    assert other.read_bytes() != first.read_bytes()
+    assert read_edges(other)[1]["seed"] == 1
+    assert (tmp_path / "tiny" / "gaussians.ply").read_bytes() != (runs / "tiny" / "gaussians.ply").read_bytes()
+
+
+# -------------------------------------------------------------------------------------------------------- progress
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_warnings_are_shown_even_when_quiet(capsys, quiet):
+    progress = PlainProgress(quiet)
+    progress.say("information")
+    progress.warn("trouble")
+    assert capsys.readouterr().err == ("" if quiet else "information\n") + "warning: trouble\n"
+
+
+def test_plain_progress_tells_share_and_time_left(capsys, monkeypatch):
+    clock = iter([0.0, 0.0, 5.0, 15.0, 15.0])  # enter, start, a step too soon to tell, a step worth a line, its pace
+    monkeypatch.setattr("taichi_edges.progress.time.monotonic", lambda: next(clock))
+    with PlainProgress().track("train", 4) as report:
+        report(1, "loss 0.5")
+        report(3, "loss 0.4")
+    assert capsys.readouterr().err == "  train: 75 %, about 5 s left, loss 0.4\n"
+
+
+def test_terminal_progress_prints_texts_as_they_are(capsys):
+    progress = TerminalProgress()
+    text = "/a/very/long/path/" + 20 * "[bold]:warning:/" + "file.json"
+    progress.say(text)
+    with progress.track("train", 2) as report:
+        report(1, "half")
+    assert text in capsys.readouterr().err.replace("\r", "")
+
+
+# -------------------------------------------------------------------------------------------------- temporary files
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_temporary_one(tmp_path):
+    path = tmp_path / "file.txt"
+    path.write_text("old")
+    with pytest.raises(RuntimeError):
+        with replacing(path) as unfinished:
+            unfinished.write_text("half")
+            raise RuntimeError
+    assert [each.name for each in tmp_path.iterdir()] == ["file.txt"] and path.read_text() == "old"
+
+
+def test_temporary_files_of_the_dead_are_removed_and_those_of_the_living_stay(tmp_path):
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    living = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    try:
+        names = [f".views.{process.pid}.unfinished.npz" for process in (dead, living)]
+        for name in [*names, "views.npz"]:
+            (tmp_path / name).touch()
+        remove_unfinished(tmp_path)
+        assert {path.name for path in tmp_path.iterdir()} == {names[1], "views.npz"}
+    finally:
+        living.communicate(b"\n")

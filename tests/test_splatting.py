@@ -1,0 +1,274 @@
+"""The splatting kernels give the image of the formula and choose the pixels the paper asks for."""
+
+import numpy as np
+import pytest
+from reference_splatting import (
+    INSIDE, MOSTLY_EDGES, NO_EDGES, OBLIQUE, OUTSIDE, PARAMETERS, Scene, alphas, image_loss, project, random_gaussians,
+    random_scene, render,
+)
+
+from taichi_edges.splatting.gaussians import Gaussians, rotation_matrices, start_gaussians
+from taichi_edges.splatting.splat import pack_mask
+
+WIDTH, HEIGHT = 50, 40
+VIEWS = (OUTSIDE, OBLIQUE, INSIDE)
+
+# Largest error of C = 1 - prod (1 - a_i). |dC| <= sum T / (1 - a_i) |da_i| <= max |da_i| / a_i, however many Gaussians
+# there are. The relative error of one a_i is some roundings (6e-8 in f32, 1e-16 in f64), of which the determinant of a
+# needle's covariance makes up to 1e3 (the squared ratio of its axes in pixels), times the exponent, at most 5.5.
+# The cuts (1/255, 3 sigma) are steps, which rounding may carry a pixel across: C must lie between the twin's images
+# with cuts a little stricter and a little laxer (SLACK, by the same reckoning; boxes end at some 100 px).
+TOLERANCE = {"f32": 3e-4, "f64": 1e-11}
+SLACK = {"f32": 1e-3, "f64": 1e-9}
+
+
+def assert_image(image, gaussians, camera, real):
+    """`image` is the twin's, up to rounding."""
+    height, width = image.shape
+    strict = render(gaussians, camera, width, height, -SLACK[real])
+    lax = render(gaussians, camera, width, height, SLACK[real])
+    assert np.isfinite(image).all()
+    assert (image >= strict - TOLERANCE[real]).all() and (image <= lax + TOLERANCE[real]).all()
+
+
+def selected(splatter):
+    """Columns and rows (p, 2), weights and targets (p,) of the selected pixels."""
+    selection = splatter.selection
+    rows, columns = np.divmod(selection.pixels.to_numpy()[: selection.count], selection.width)
+    weights, targets = (field.to_numpy()[: selection.count] for field in (selection.weights, selection.targets))
+    return np.stack([columns, rows], axis=1), weights, targets
+
+
+# Images ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [0, 1, 511, 512, 513, 1025])  # 512: the fewest items Taichi gives a thread
+@pytest.mark.parametrize("real", ["f64", "f32"])
+def test_image_is_the_twins(open_splatter, seed, generator, real, count):
+    scene = random_scene(seed, WIDTH, HEIGHT)
+    splatter = open_splatter(scene, real, loss="whole_image")
+    gaussians = random_gaussians(count, generator)
+    splatter.load(gaussians)
+    for view in VIEWS:
+        image = splatter.render(view)
+        assert image.shape == (HEIGHT, WIDTH)
+        assert_image(image, gaussians, scene.camera(view), real)
+
+
+@pytest.mark.parametrize("width", [31, 32, 33, 64, 100])  # the mask packs 32 columns into a word
+def test_image_of_any_width_is_the_twins(open_splatter, seed, generator, width):
+    scene = random_scene(seed, width, HEIGHT)
+    splatter = open_splatter(scene, loss="whole_image")
+    gaussians = random_gaussians(200, generator, large=1)
+    splatter.load(gaussians)
+    for view in VIEWS:
+        assert_image(splatter.render(view), gaussians, scene.camera(view), "f64")
+
+
+def test_random_inputs_reach_every_branch(seed, generator):
+    """The comparisons above are worth something only if their inputs come across the cuts."""
+    scene, gaussians = random_scene(seed, WIDTH, HEIGHT), random_gaussians(1025, generator, large=1)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    centres, covariances, opacities = project(gaussians, *scene.camera(INSIDE))
+    assert (opacities == 0).sum() > 50, "behind the camera"
+    centres, covariances, opacities = project(gaussians, *scene.camera(OUTSIDE))
+    half = 3 * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    low, high = centres - half, centres + half
+    outside = ((high < 0) | (low > [WIDTH - 1, HEIGHT - 1])).any(axis=1)
+    cut = ((low < 0) | (high > [WIDTH - 1, HEIGHT - 1])).any(axis=1) & ~outside
+    assert outside.sum() > 10, "empty boxes"
+    assert cut.sum() > 10, "boxes cut by the border"
+    assert (opacities < 1 / 255).sum() > 10, "never drawn"
+    contributions = alphas((centres, covariances, opacities), pixels)
+    assert (contributions == 0.999).sum() > 0, "clamped"
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_image_does_not_depend_on_the_number_of_threads(open_splatter, seed, generator, threads):
+    scene, gaussians = random_scene(seed, WIDTH, HEIGHT), random_gaussians(1025, generator)
+    images = []
+    for count in (threads, 2):
+        splatter = open_splatter(scene, "f32", threads=count, loss="whole_image")
+        splatter.load(gaussians)
+        images.append(splatter.render(OUTSIDE))
+    # The same factors in another order: a rounding of 6e-8 for each of at most 1025.
+    np.testing.assert_allclose(1 - images[0], 1 - images[1], rtol=0, atol=1025 * 6e-8)
+
+
+def test_schedule_of_the_gpu_gives_the_same_image(open_splatter, seed, generator):
+    scene, gaussians = random_scene(seed, WIDTH, HEIGHT), random_gaussians(513, generator)
+    splatter = open_splatter(scene, loss="whole_image", schedule="log")
+    splatter.load(gaussians)
+    for view in VIEWS:
+        assert_image(splatter.render(view), gaussians, scene.camera(view), "f64")
+
+
+def test_one_round_gaussian_by_hand(open_splatter):
+    """sigma 2 px at the middle of a view along z: covariance 4 + 0.3, opacity times 4 / 4.3."""
+    intrinsics = np.array([[[100.0, 0, 16], [0, 100, 16], [0, 0, 1]]])
+    pose = np.eye(4)[None, :3]
+    splatter = open_splatter(Scene(np.zeros((1, 33, 33), np.uint8), intrinsics, pose), loss="whole_image")
+    splatter.load(Gaussians(np.array([[0.0, 0, 1]]), np.log(np.full((1, 3), 0.02)), np.eye(4)[:1], np.zeros(1)))
+    image = splatter.render(0)
+    assert image[16, 16] == pytest.approx(0.5 * 4 / 4.3, rel=1e-12)
+    assert image[16, 19] == pytest.approx(0.5 * 4 / 4.3 * np.exp(-0.5 * 9 / 4.3), rel=1e-12)
+    assert image[16, 22] > 1 / 255 and image[16, 23] == 0.0  # 3 sigma are 6.2 px
+    np.testing.assert_allclose(image, image.T, atol=1e-15)
+    np.testing.assert_allclose(image, image[::-1], atol=1e-15)
+
+
+def test_views_do_not_leave_traces_in_each_other(open_splatter, seed, generator):
+    splatter = open_splatter(random_scene(seed, WIDTH, HEIGHT), loss="whole_image")
+    splatter.load(random_gaussians(300, generator))
+    first = splatter.render(OUTSIDE)
+    splatter.render(INSIDE)
+    np.testing.assert_array_equal(splatter.render(OUTSIDE), first)
+    splatter.load(random_gaussians(0, generator))
+    np.testing.assert_array_equal(splatter.render(OUTSIDE), 0.0)
+
+
+# Selections -----------------------------------------------------------------------------------------------------------
+
+
+def test_mask_packs_bit_b_of_word_w_as_column_32_w_plus_b(generator):
+    edges = generator.random((2, 3, 71)) < 0.5
+    words = pack_mask(edges)
+    assert words.shape == (2, 3, 3) and words.dtype == np.uint32
+    columns = np.arange(96)
+    unpacked = (words[:, :, columns // 32] >> (columns % 32).astype(np.uint32)) & 1
+    np.testing.assert_array_equal(unpacked[:, :, :71], edges)
+    assert not unpacked[:, :, 71:].any()
+
+
+def test_whole_image_weighs_every_pixel_alike(open_splatter, seed):
+    scene = random_scene(seed, WIDTH, HEIGHT)
+    splatter = open_splatter(scene, loss="whole_image")
+    assert splatter.select_pixels(OBLIQUE, 0) == WIDTH * HEIGHT
+    pixels, weights, targets = selected(splatter)
+    np.testing.assert_array_equal(pixels[:, 1] * WIDTH + pixels[:, 0], np.arange(WIDTH * HEIGHT))
+    np.testing.assert_array_equal(weights, 1 / (WIDTH * HEIGHT))
+    np.testing.assert_allclose(targets, scene.edge_maps[OBLIQUE].ravel() / 255, rtol=1e-15)
+
+
+@pytest.mark.parametrize("view", [OBLIQUE, MOSTLY_EDGES, NO_EDGES])
+def test_class_weights_give_edges_and_background_one_half_each(open_splatter, seed, view):
+    scene = random_scene(seed, WIDTH, HEIGHT)
+    splatter = open_splatter(scene, loss="class_weighted")
+    assert splatter.select_pixels(view, 0) == WIDTH * HEIGHT
+    _, weights, _ = selected(splatter)
+    edges = scene.edge_maps[view].ravel() >= 128
+    for pixels in (edges, ~edges):
+        if pixels.any():
+            np.testing.assert_allclose(weights[pixels], 0.5 / pixels.sum(), rtol=1e-15)
+
+
+@pytest.mark.parametrize("view", [OUTSIDE, OBLIQUE, MOSTLY_EDGES])
+def test_balanced_selection_has_all_edge_pixels_and_as_many_others(open_splatter, seed, view):
+    scene = random_scene(seed, WIDTH, HEIGHT)
+    splatter = open_splatter(scene)
+    edges = scene.edge_maps[view] >= 128
+    background = min(edges.sum(), (~edges).sum())
+    choices = []
+    for pixel_seed in (7, 7, 8):
+        assert splatter.select_pixels(view, pixel_seed) == edges.sum() + background
+        pixels, weights, targets = selected(splatter)
+        columns, rows = pixels.T
+        assert len(np.unique(pixels, axis=0)) == len(pixels), "no pixel twice"
+        assert edges[rows, columns].sum() == edges.sum(), "every edge pixel"
+        np.testing.assert_allclose(weights, 1 / len(pixels), rtol=1e-15)
+        np.testing.assert_allclose(targets, scene.edge_maps[view][rows, columns] / 255, rtol=1e-15)
+        chosen = np.zeros(edges.shape, bool)
+        chosen[rows, columns] = True
+        np.testing.assert_array_equal(splatter.selection.mask.to_numpy(), pack_mask(chosen[None])[0])
+        choices.append(pixels)
+    np.testing.assert_array_equal(choices[0], choices[1])
+    if background == edges.sum():  # else the whole background is chosen, in another order
+        assert (np.sort(choices[0], axis=0) != np.sort(choices[2], axis=0)).any(), "another seed chooses others"
+
+
+def test_background_pixels_are_drawn_alike(open_splatter, seed):
+    scene = random_scene(seed, WIDTH, HEIGHT)
+    splatter = open_splatter(scene)
+    edges = scene.edge_maps[OUTSIDE] >= 128
+    draws = 1000
+    hits = np.zeros(edges.shape)
+    for pixel_seed in range(draws):
+        splatter.select_pixels(OUTSIDE, pixel_seed)
+        columns, rows = selected(splatter)[0].T
+        hits[rows, columns] += 1
+    share = edges.sum() / (~edges).sum()
+    deviations = (hits[~edges] - draws * share) / np.sqrt(draws * share * (1 - share))
+    # 1700 nearly independent, nearly normal numbers: beyond 5.5 deviations in one run of 10^4; their variance is 1 up
+    # to sqrt(2 / 1700) = 0.034, of which 6 are allowed.
+    assert np.abs(deviations).max() < 5.5
+    assert abs(deviations.var() - 1) < 0.2
+
+
+def test_a_view_without_edge_pixels_selects_none(open_splatter, seed, generator):
+    splatter = open_splatter(random_scene(seed, WIDTH, HEIGHT))
+    splatter.load(random_gaussians(20, generator))
+    assert splatter.select_pixels(NO_EDGES, 0) == 0
+    splatter.record(NO_EDGES)
+    assert splatter.loss[None] == 0.0
+
+
+@pytest.mark.parametrize("loss", ["balanced", "class_weighted", "whole_image"])
+def test_loss_is_the_twins(open_splatter, seed, generator, loss):
+    scene, gaussians = random_scene(seed, WIDTH, HEIGHT), random_gaussians(100, generator)
+    splatter = open_splatter(scene, loss=loss)
+    splatter.load(gaussians)
+    for view in (*VIEWS, MOSTLY_EDGES):
+        splatter.select_pixels(view, 3)
+        splatter.record(view)
+        # A weighted mean of |C - target|, so no less exact than C.
+        assert splatter.loss[None] == pytest.approx(image_loss(gaussians, scene.camera(view), *selected(splatter)), abs=1e-11)
+
+
+def test_threshold_parts_edges_from_background_at_the_same_level_as_the_views(open_splatter):
+    maps = np.arange(256, dtype=np.uint8).reshape(1, 16, 16)
+    scene = Scene(maps, np.eye(3)[None], np.eye(4)[None, :3])
+    splatter = open_splatter(scene, edge_threshold=0.4)
+    splatter.select_pixels(0, 0)
+    edges = np.flatnonzero(maps.ravel() >= 0.4 * 255)  # as Views.edge_support reads it
+    assert splatter.images.edge_counts[0] == len(edges)
+    np.testing.assert_array_equal(splatter.selection.pixels.to_numpy()[: len(edges)], edges)
+
+
+# Gaussians ------------------------------------------------------------------------------------------------------------
+
+
+def test_gaussians_grow_beyond_the_capacity_without_a_change(open_splatter, seed, generator):
+    scene = random_scene(seed, WIDTH, HEIGHT)
+    splatter = open_splatter(scene, loss="whole_image", edge_threshold=0.6)  # of its own: the others stay small
+    few, many = random_gaussians(10, generator), random_gaussians(5000, generator)
+    splatter.load(few)
+    splatter.render(OUTSIDE)
+    moments = generator.random((2, 5000, 11))
+    splatter.load(many, moments)
+    assert splatter.fields.capacity == 8192
+    for name in PARAMETERS:
+        np.testing.assert_array_equal(getattr(splatter.fields.gaussians(), name), getattr(many, name))
+    np.testing.assert_array_equal(splatter.fields.moments(), moments)
+    assert_image(splatter.render(OUTSIDE), many, scene.camera(OUTSIDE), "f64")
+    splatter.load(few)
+    assert_image(splatter.render(OUTSIDE), few, scene.camera(OUTSIDE), "f64")
+    np.testing.assert_array_equal(splatter.fields.moments(), np.zeros((2, 10, 11)))
+
+
+def test_start_gaussians_are_the_supplements(generator):
+    points = generator.random((50, 3))
+    gaussians = start_gaussians(points, generator)
+    np.testing.assert_array_equal(gaussians.means, points.astype(np.float32))
+    np.testing.assert_allclose(gaussians.scales, 0.004, rtol=1e-6)
+    np.testing.assert_allclose(gaussians.opacities, 0.08, rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(gaussians.quaternions, axis=1), 1, rtol=1e-6)
+
+
+def test_direction_is_the_axis_of_the_largest_scale(generator):
+    gaussians = random_gaussians(50, generator)
+    covariances = rotation_matrices(gaussians.quaternions) * gaussians.scales[:, None] ** 2
+    covariances = covariances @ np.swapaxes(rotation_matrices(gaussians.quaternions), 1, 2)
+    largest = np.linalg.eigh(covariances)[1][:, :, 2]
+    # Eigenvectors turn by rounding / gap of the eigenvalues; among 50 random Gaussians gaps of 1e-6 do not occur.
+    np.testing.assert_allclose(np.abs((largest * gaussians.directions()).sum(axis=1)), 1, atol=1e-9)

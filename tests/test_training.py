@@ -1,0 +1,227 @@
+"""Training follows the paper's schedule, keeps the right Gaussians, and finds the edges of a part."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from taichi_edges.progress import Progress
+from taichi_edges.scene import DensityConfig, TrainConfig
+from taichi_edges.splatting.density import Population, cull_opacity, cull_support, duplicate, thin
+from taichi_edges.splatting.gaussians import Gaussians, logit, start_gaussians
+from taichi_edges.splatting.seeding import random_points
+from taichi_edges.splatting.training import Training, nearest_neighbors, rates
+from taichi_edges.synthetic.parts import PARTS
+from taichi_edges.synthetic.rendering import Imperfections, render_views
+from taichi_edges.synthetic.visibility import sample_edges
+
+PIXEL = 0.02  # unit-cube units, in views of 96 x 96: the cube is some 60 px wide
+
+
+@pytest.fixture(scope="module")
+def block():
+    """A block of known edges, and 12 small views of it."""
+    part = PARTS["block"]()
+    views, _ = render_views(part, 12, 96, Imperfections.none(), np.random.default_rng(0))
+    return views, sample_edges(part, 0.002).points
+
+
+def numbered_population(means, opacities=None):
+    """A Population in which the moments and the positional gradient of Gaussian i are 1 + i, so that it can be told."""
+    count = len(means)
+    numbers = 1.0 + np.arange(count, dtype=np.float32)
+    gaussians = Gaussians(
+        np.asarray(means, np.float32),
+        np.repeat(-numbers[:, None], 3, axis=1),
+        np.repeat(numbers[:, None], 4, axis=1),
+        logit(np.full(count, 0.5) if opacities is None else np.asarray(opacities)).astype(np.float32),
+    )
+    moments = np.repeat(numbers[:, None], 11, axis=1)
+    return Population(gaussians, moments, -moments, numbers)
+
+
+def assert_kept(population, expected):
+    """Exactly the Gaussians of these indices, each with what is its own."""
+    numbers = 1.0 + np.asarray(expected)
+    np.testing.assert_array_equal(population.positional_gradients, numbers)
+    np.testing.assert_array_equal(population.first_moments, np.repeat(numbers[:, None], 11, axis=1))
+    np.testing.assert_array_equal(population.second_moments, -population.first_moments)
+    np.testing.assert_array_equal(population.gaussians.quaternions, np.repeat(numbers[:, None], 4, axis=1))
+
+
+# Density control ------------------------------------------------------------------------------------------------------
+
+
+def test_faint_gaussians_are_culled_with_their_moments(generator):
+    opacities = np.array([0.9, 0.01, 0.06, 0.04, 0.5])
+    assert_kept(cull_opacity(numbered_population(generator.random((5, 3)), opacities), 0.05), [0, 2, 4])
+
+
+def test_gaussians_off_the_edges_are_culled_with_their_moments(block, generator):
+    views, edges = block
+    on = edges[:: len(edges) // 30]
+    off = generator.random((60, 3))
+    off = off[cKDTree(edges).query(off)[0] > 5 * PIXEL]
+    culled = cull_support(numbered_population(np.concatenate([on, off])), views, 0.3, 0.5)
+    kept = culled.positional_gradients.astype(int) - 1
+    assert_kept(culled, kept)
+    # Most edges are seen from at least half of the views; a stray point falls on the lines (7 % of the pixels) by chance.
+    assert (kept < len(on)).sum() > 0.7 * len(on)
+    assert (kept >= len(on)).sum() < 0.2 * len(off)
+
+
+def test_thinning_keeps_the_strongest_of_a_neighbourhood(block):
+    views, edges = block
+    centre = edges[np.argmax(views.edge_support(edges)[0])]
+    # On an edge that many views see; half a pixel beside it; alone in empty space.
+    population = numbered_population([centre, centre + 0.75 * PIXEL, [0.02, 0.02, 0.98]])
+    assert_kept(thin(population, views, 2 * PIXEL, 0.9), [0, 2])
+    assert_kept(thin(population, views, 0.5 * PIXEL, 0.9), [0, 1, 2])  # too far apart to compete
+
+
+def test_duplicates_stand_near_their_source_with_moments_of_zero(generator):
+    population = numbered_population(generator.random((9, 3)))  # gradients 1..9: 6, 7, 8, 9 are above half
+    doubled = duplicate(population, 0.5, 2, 0.01, 1000, generator)
+    assert_kept(doubled.keep(np.arange(9)), np.arange(9))
+    sources = [5, 6, 7, 8, 5, 6, 7, 8]
+    copies = doubled.keep(np.arange(9, len(doubled)))
+    np.testing.assert_array_equal(copies.gaussians.quaternions[:, 0], 1.0 + np.array(sources))
+    np.testing.assert_array_equal(copies.gaussians.log_scales, population.gaussians.log_scales[sources])
+    np.testing.assert_array_equal(copies.gaussians.opacity_logits, population.gaussians.opacity_logits[sources])
+    assert not copies.first_moments.any() and not copies.second_moments.any()
+    assert not copies.positional_gradients.any()
+    offsets = copies.gaussians.means - population.gaussians.means[sources]
+    assert (np.abs(offsets) > 0).all() and np.abs(offsets).max() < 0.06  # normal: 6 deviations
+    for array in (*vars(doubled.gaussians).values(), doubled.first_moments, doubled.second_moments):
+        assert array.dtype == np.float32 and len(array) == 17
+
+
+@pytest.mark.parametrize("maximum, expected", [(12, 12), (9, 9), (5, 9), (1000, 17)])
+def test_duplication_respects_the_maximum(generator, maximum, expected):
+    population = numbered_population(generator.random((9, 3)))
+    assert len(duplicate(population, 0.5, 2, 0.01, maximum, generator)) == expected
+
+
+def test_duplicates_spread_with_the_given_deviation(generator):
+    population = numbered_population(np.zeros((2, 3)))
+    offsets = duplicate(population, 0.5, 5000, 0.01, 10**6, generator).gaussians.means[2:]
+    # 15000 numbers: the error of a deviation is 1 / sqrt(2 * 15000) = 0.6 %, of which 5 are allowed.
+    assert offsets.std() == pytest.approx(0.01, rel=0.03)
+
+
+def test_nothing_to_duplicate(generator):
+    population = numbered_population(np.zeros((0, 3)))
+    assert len(duplicate(population, 0.5, 2, 0.01, 100, generator)) == 0
+    population = numbered_population(generator.random((4, 3)))
+    still = Population(population.gaussians, population.first_moments, population.second_moments, np.zeros(4))
+    assert len(duplicate(still, 0.5, 2, 0.01, 100, generator)) == 4
+    assert len(duplicate(population, 0.5, 0, 0.01, 100, generator)) == 4
+
+
+# Neighbours -----------------------------------------------------------------------------------------------------------
+
+
+def brute_force_distances(points, k):
+    """(n, k) sorted distances to the k nearest others."""
+    distances = np.linalg.norm(points[:, None] - points, axis=2)
+    np.fill_diagonal(distances, np.inf)
+    return np.sort(distances, axis=1)[:, :k]
+
+
+@pytest.mark.parametrize("count", [5, 6, 200])
+def test_nearest_neighbors_are_the_nearest(generator, count):
+    points = generator.random((count, 3)).astype(np.float32)
+    neighbors = nearest_neighbors(points, 4)
+    assert neighbors.shape == (count, 4)
+    assert (neighbors != np.arange(count)[:, None]).all()
+    assert all(len(set(row)) == 4 for row in neighbors)
+    distances = np.linalg.norm(points[:, None] - points[neighbors], axis=2)
+    np.testing.assert_allclose(np.sort(distances, axis=1), brute_force_distances(points, 4), rtol=1e-5)
+
+
+def test_coinciding_points_are_neighbours_of_each_other_but_not_of_themselves(generator):
+    points = np.repeat(generator.random((20, 3)), 7, axis=0)[generator.permutation(140)]
+    neighbors = nearest_neighbors(points, 4)
+    assert (neighbors != np.arange(140)[:, None]).all()
+    assert all(len(set(row)) == 4 for row in neighbors)
+    np.testing.assert_array_equal(points[neighbors], np.repeat(points[:, None], 4, axis=1))
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_the_last_neighbour_repeats_where_there_are_too_few(generator, count):
+    points = generator.random((count, 3))
+    neighbors = nearest_neighbors(points, 4)
+    assert neighbors.shape == (count, 4)
+    assert (neighbors != np.arange(count)[:, None]).all()
+    distances = np.linalg.norm(points[:, None] - points[neighbors], axis=2)
+    expected = brute_force_distances(points, count - 1)
+    np.testing.assert_allclose(distances[:, : count - 1], expected, rtol=1e-12)
+    np.testing.assert_array_equal(neighbors[:, count - 1 :], np.repeat(neighbors[:, count - 2, None], 5 - count, axis=1))
+
+
+# Schedule -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "epoch, means",
+    [
+        (0, 1e-3),
+        (9, 1e-3),
+        (10, 1e-3 * 0.75),
+        (29, 1e-3 * 0.75**2),
+        (30, 1e-3 * 0.75**3),
+        (49, 1e-3 * 0.75**4),
+        (50, 1e-3 * 0.75**5),
+        (60, 1e-3 * 0.75**5),  # five times, then no more
+        (499, 1e-3 * 0.75**5),
+    ],
+)
+def test_learning_rates_are_the_supplements(epoch, means):
+    others = (2e-4, 1e-3, 3e-2) if epoch >= 30 else (0.0, 0.0, 0.0)  # positions only for 30 epochs
+    assert rates(TrainConfig(), epoch) == pytest.approx((means, *others))
+
+
+# End to end -----------------------------------------------------------------------------------------------------------
+
+
+def train(start_taichi, block, config):
+    """One run on the block, from random points."""
+    views, _ = block
+    start_taichi("f32", 2)
+    generator = np.random.default_rng(0)
+    points = random_points(config.gaussians, views.box, generator)
+    start = start_gaussians(points, generator, config.initial_scale, config.initial_opacity)
+    return start, *Training(views, config, generator, threads=2).run(start, Progress())
+
+
+def test_training_finds_the_edges_of_a_block(start_taichi, block):
+    """A short schedule with everything in it: positions alone, duplication, culls, regularisers."""
+    density = DensityConfig(duplicate_epochs=[25, 35], cull_opacity_epochs=[50], cull_support_epochs=[45])
+    config = TrainConfig(
+        epochs=65,
+        gaussians=300,
+        initial_scale=0.01,
+        only_means_epochs=10,
+        regularize_from_epoch=55,
+        density=density,
+    )
+    start, trained, records = train(start_taichi, block, config)
+    assert len(records) == 65 and records[-1].gaussians == len(trained)
+    assert records[25].gaussians > 300 > 0
+    assert records[-1].loss < 0.5 * records[0].loss
+    tree = cKDTree(block[1])
+    opaque = trained.opacities > 0.5
+    assert opaque.sum() > 50
+    assert (tree.query(start.means)[0] < PIXEL).mean() < 0.05
+    assert (tree.query(trained.means[opaque])[0] < PIXEL).mean() > 0.5
+    for array in vars(trained).values():
+        assert np.isfinite(array).all()
+
+
+def test_the_same_seed_trains_the_same_gaussians(start_taichi, block):
+    density = DensityConfig(duplicate_epochs=[4], cull_opacity_epochs=[], cull_support_epochs=[6])
+    config = TrainConfig(
+        epochs=8, gaussians=1500, only_means_epochs=3, regularize_from_epoch=5, regularize_every=3, density=density
+    )
+    runs = [train(start_taichi, block, config) for _ in range(2)]
+    for one, other in zip(vars(runs[0][1]).values(), vars(runs[1][1]).values()):
+        assert one.tobytes() == other.tobytes()
