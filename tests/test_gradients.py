@@ -94,10 +94,10 @@ def test_hand_adjoint_equals_taichis_own(open_splatter, seed, generator, view):
         splatter.select_pixels(view, 2)
         record(view)
         results.append((splatter.selection.transmittance.to_numpy()[: splatter.selection.count], gradients(splatter)))
-    # A product against a sum of logarithms of some 100 factors: the rounding of 1e-16 for each of them, and as much
-    # again wherever 1 / (1 - a) magnifies a difference.
+    # A product against a sum of logarithms of some 100 factors: the rounding of 1e-16 for each of them. In the gradients
+    # times up to 1e3 for 1 / (1 - a), times up to 1e3 in the projection of needles.
     np.testing.assert_allclose(results[0][0], results[1][0], rtol=1e-12, atol=1e-300)
-    assert_gradients(results[0][1], results[1][1], 1e-12)
+    assert_gradients(results[0][1], results[1][1], 1e-10)
 
 
 @pytest.mark.parametrize(

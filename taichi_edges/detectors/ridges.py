@@ -13,6 +13,7 @@ import numpy as np
 SIGMA_PER_WIDTH = 0.29  # 1 / (2 sqrt 3): the smallest scale at which a bar of that width has one ridge (Steger, eq. 17)
 MIN_SIGMA = 0.8  # px; below, the derivative of the Gaussian is not sampled well
 DRAWN_SIGMA = 1.0  # px; about what DexiNed draws (FWHM 2.4 px), wide enough to pull a Gaussian from 3 px away
+MIN_CURVATURE = 0.1  # of that of a line as narrow as the scale; on a flank rounding alone leaves a faint curvature
 MIN_PIXELS = 6  # a ridge of fewer is no line
 PATCH = 3  # px; half size of the patch in which a ridge point is drawn
 
@@ -48,7 +49,8 @@ def ridge_points(edge_map, sigma, threshold):
     with np.errstate(divide="ignore", invalid="ignore"):
         offset = -(gx * nx + gy * ny) / curvature
     du, dv = offset * nx, offset * ny
-    on_ridge = (curvature < 0) & (np.abs(du) <= 0.5) & (np.abs(dv) <= 0.5) & (image >= threshold)
+    sharp = curvature < -MIN_CURVATURE * image / sigma**2
+    on_ridge = sharp & (np.abs(du) <= 0.5) & (np.abs(dv) <= 0.5) & (image >= threshold)
     on_ridge = _without_specks(on_ridge)
     rows, columns = np.nonzero(on_ridge)
     points = np.stack([columns + du[on_ridge], rows + dv[on_ridge]], axis=1)

@@ -14,8 +14,9 @@ ROBUST_ROUNDS = 10
 REPARAMETRIZATIONS = 4
 TURN_PER_CUBIC = np.radians(100.0)  # one cubic follows a circular arc of 90 degrees to 3e-4 of the radius
 POINTS_PER_PIECE = 6  # at least
-WORTH_A_PIECE = 0.8  # another piece must bring the mean distance down to this share; noise alone brings it to 0.9
-ROUNDING = 1e-9  # unit-cube units: points that are exactly in a row are a line, whatever the last digits say
+WORTH_A_PIECE = 0.8  # another piece must bring the error down to this share
+NOISE_FLOOR = 5e-4  # unit-cube units; a mean distance below is no reason for a curve or for another piece
+LINE_PARAMETERS = 4  # of a line in space
 END_QUANTILE = 0.01  # of the points along a line: its ends, so that one stray point does not lengthen it
 BENDING = 1e-3  # penalty on second differences of the control points, relative to the data
 CURVE_SAMPLES = 128  # for each cubic, where distances to a curve are measured
@@ -53,7 +54,11 @@ def fit_clusters(points, labels, config):
 
 
 def fit_cluster(points, config):
-    """Fit (n, 3) points: the curve is kept when its mean distance e_c <= delta * e_l, the line's (paper 3.3)."""
+    """Fit (n, 3) points: the curve is kept when its error e_c <= delta * e_l, the line's (paper 3.3).
+
+    Errors are mean distances, corrected for the parameters (`corrected_error`): a curve through few points is close to
+    them whatever they are.
+    """
     if len(np.unique(points, axis=0)) < 2:
         return Fit("degenerate")
     line, line_error = fit_line(points, config.line_tolerance)
@@ -61,7 +66,7 @@ def fit_cluster(points, config):
         ordering = order_points(points)
         curves, curve_error = fit_curve(points, ordering, config.line_tolerance)
         long_enough = np.linalg.norm(np.diff(evaluate_bezier(curves, [0, 0.5, 1]), axis=1), axis=2).sum()
-        if curve_error + ROUNDING <= config.delta * line_error and long_enough >= config.min_length:
+        if max(curve_error, NOISE_FLOOR) <= config.delta * line_error and long_enough >= config.min_length:
             return Fit("loop" if ordering.closed else "curve", curves=curves)
     if np.linalg.norm(line[1] - line[0]) < config.min_length:
         return Fit("short")
@@ -72,7 +77,7 @@ def fit_line(points, tolerance):
     """Robust line segment through (n, 3) points: iteratively reweighted least squares (Geman-McClure).
 
     tolerance: distance at which a point's weight has fallen to a quarter.
-    Returns end points (2, 3) and the mean distance of all points to the line.
+    Returns end points (2, 3) and the corrected mean distance of all points to the line.
     """
     weights = np.ones(len(points))
     for _ in range(ROBUST_ROUNDS):
@@ -87,7 +92,16 @@ def fit_line(points, tolerance):
     if len(inliers) > 2:  # along an edge the points lie evenly: what the quantiles leave out at each end is known
         ends += np.array([-1, 1]) * np.ptp(ends) * END_QUANTILE / (1 - 2 * END_QUANTILE)
         ends = np.clip(ends, inliers.min(), inliers.max())
-    return centre + ends[:, None] * direction, float(distances.mean())
+    return centre + ends[:, None] * direction, corrected_error(distances, LINE_PARAMETERS)
+
+
+def corrected_error(distances, parameters):
+    """Mean of (n,) distances to a fitted edge, as it would be without the fit's `parameters` adapting to the points.
+
+    Across the edge n points give 2 n residuals; sqrt(2 n / (2 n - parameters)) undoes what the fit took away.
+    """
+    freedom = 2 * len(distances) - parameters
+    return float(distances.mean() * np.sqrt(2 * len(distances) / freedom)) if freedom > 0 else float("inf")
 
 
 def fit_curve(points, ordering, tolerance):
@@ -95,7 +109,7 @@ def fit_curve(points, ordering, tolerance):
 
     The chain is a cubic spline with a continuous tangent, cut into its Bezier pieces; as many pieces as the points'
     total turning asks for, and one more while that pays. (Continuous curvature as well would need twice the pieces to
-    follow a circle.) Returns control points (m, 4, 3) and the mean distance of all points to the chain.
+    follow a circle.) Returns control points (m, 4, 3) and the corrected mean distance of all points to the chain.
     """
     turning = 2 * np.pi if ordering.closed else total_turning(points, ordering.arc)
     most = max(len(points) // POINTS_PER_PIECE, 1)
@@ -103,7 +117,7 @@ def fit_curve(points, ordering, tolerance):
     curves, error = _fit_chain(points, ordering, tolerance, pieces)
     for pieces in range(pieces + 1, most + 1):
         more, smaller_error = _fit_chain(points, ordering, tolerance, pieces)
-        if smaller_error > WORTH_A_PIECE * error:
+        if max(smaller_error, NOISE_FLOOR) > WORTH_A_PIECE * error:
             break
         curves, error = more, smaller_error
     return curves, error
@@ -118,7 +132,7 @@ def _fit_chain(points, ordering, tolerance, pieces):
         distances, parameters = nearest_on_chain(points, curves)
         arc = _reparametrize(arc, parameters, length, closed)
         weights = 1.0 / (1.0 + (distances / tolerance) ** 2) ** 2
-    return curves, float(distances.mean())
+    return curves, corrected_error(distances, 4 * (pieces + 1))  # two across each end of each piece, value and slope
 
 
 def total_turning(points, arc):

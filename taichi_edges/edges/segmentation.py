@@ -12,7 +12,7 @@ from taichi_edges.edges.ordering import order_points
 
 STATIONS = 32  # places along a cluster at which it may be cut
 MIN_STRETCH = 5  # points; a line through fewer says nothing
-LINE_PRICE, CURVE_PRICE = 4, 8  # free parameters of a segment and of an arc in space, less their shared end
+LINE_PRICE, CURVE_PRICE = 5, 8  # free parameters: a line and where it ends; a circular arc and where it starts and ends
 OUTLIER = 9.0  # squared residuals in units of the noise count up to here
 NOISE_WINDOW = 10  # points on which a quadratic measures the local scatter
 MIN_NOISE = 1e-3  # unit-cube units; detectors' errors vary slowly along an edge, so the scatter alone is too small

@@ -1,0 +1,84 @@
+"""Thinning of edge maps: ridges are found where the lines are, whatever their width."""
+
+import numpy as np
+import pytest
+
+from taichi_edges.detectors.ridges import DRAWN_SIGMA, draw_ridges, gaussian_derivatives, ridge_points, thin_edge_maps
+from taichi_edges.support import line_width
+from taichi_edges.views import Views
+
+SIZE = 120
+
+
+def line_map(angle, width, centre=(60.3, 59.8), height=255):
+    """Edge map of one straight line with a Gaussian profile of FWHM `width` px; also its unit normal."""
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+    normal = np.array([-np.sin(angle), np.cos(angle)])
+    distance = (columns - centre[0]) * normal[0] + (rows - centre[1]) * normal[1]
+    return np.rint(height * np.exp(-0.5 * (distance / (width / 2.355)) ** 2)).astype(np.uint8), normal
+
+
+def views_of(edge_maps):
+    """Views with the camera two units in front of the unit cube's middle, looking along z."""
+    count = len(edge_maps)
+    intrinsics = np.tile([[100.0, 0, SIZE / 2], [0, 100.0, SIZE / 2], [0, 0, 1]], (count, 1, 1))
+    pose = np.concatenate([np.eye(3), [[-0.5], [-0.5], [1.5]]], axis=1)
+    names = tuple(str(i) for i in range(count))
+    return Views(names, np.stack(edge_maps), intrinsics, np.tile(pose, (count, 1, 1)), ("",) * count)
+
+
+@pytest.mark.parametrize("width", [2.4, 5.0, 8.0])
+@pytest.mark.parametrize("angle", [0.0, 0.35, 0.8, 1.5])
+def test_ridge_lies_on_the_line_to_a_seventh_of_a_pixel(angle, width):
+    edge_map, normal = line_map(angle, width)
+    points, normals, values = ridge_points(edge_map, max(0.8, 0.29 * width), 0.3)
+    inner = ((points > 15) & (points < SIZE - 16)).all(axis=1)  # the image's border cuts the line's ends
+    assert inner.sum() > 50
+    assert np.abs((points[inner] - [60.3, 59.8]) @ normal).max() < 0.15
+    assert np.abs(np.abs(normals[inner] @ normal) - 1).max() < 0.02
+    assert values[inner].min() > 0.3
+
+
+def test_derivatives_of_a_quadratic_are_exact():
+    rows, columns = np.mgrid[:40, :50].astype(np.float32)
+    image = 0.5 + 0.02 * columns - 0.01 * rows + 0.003 * columns**2 - 0.002 * columns * rows + 0.001 * rows**2
+    gx, gy, gxx, gxy, gyy = (d[20, 25] for d in gaussian_derivatives(image, 1.5))
+    # Correlation with symmetric kernels differentiates polynomials of second degree without error, up to f32 rounding.
+    assert gx == pytest.approx(0.02 + 0.006 * 25 - 0.002 * 20, abs=1e-4)
+    assert gy == pytest.approx(-0.01 - 0.002 * 25 + 0.002 * 20, abs=1e-4)
+    assert (gxx, gxy, gyy) == pytest.approx((0.006, -0.002, 0.002), abs=1e-4)
+
+
+def test_thinned_lines_have_one_width_whatever_the_detector_drew():
+    for width in (2.4, 5.0, 8.0):
+        edge_map, _ = line_map(0.35, width)
+        measured, _ = line_width(views_of([edge_map]), 0.5)
+        thin = thin_edge_maps(edge_map[None], measured, 0.3)[0]
+        across = (thin[30:-30, 30:-30] >= 128).sum(axis=0).mean() * np.cos(0.35)
+        assert across == pytest.approx(2.355 * DRAWN_SIGMA, abs=0.6)
+
+
+@pytest.mark.parametrize("width", [3, 5, 9])
+def test_line_width_of_a_bar_is_its_number_of_pixels(width):
+    edge_map = np.zeros((SIZE, SIZE), np.uint8)
+    edge_map[50 : 50 + width] = 255
+    pixels, units = line_width(views_of([edge_map]), 0.5)
+    assert pixels == pytest.approx(width, abs=0.4)
+    assert units == pytest.approx(pixels * 2.0 / 100.0)  # 2 units away, focal length 100 px
+
+
+def test_faint_lines_are_dropped_and_strong_ones_stand_out():
+    strong, _ = line_map(0.0, 3.0, (60, 30))
+    weak, _ = line_map(0.0, 3.0, (60, 60), height=130)
+    faint, _ = line_map(0.0, 3.0, (60, 90), height=60)
+    thin = thin_edge_maps(np.maximum(np.maximum(strong, weak), faint)[None], 3.0, 0.3)[0]
+    assert thin[30, 60] == pytest.approx(255, abs=3)
+    assert thin[60, 60] == pytest.approx(255 * (0.5 + 0.5 * 130 / 255), abs=3)
+    assert thin[85:95].max() == 0
+
+
+def test_specks_leave_no_line_and_an_empty_map_stays_empty():
+    edge_map = np.zeros((SIZE, SIZE), np.uint8)
+    edge_map[40:42, 50:52] = 255
+    assert thin_edge_maps(edge_map[None], 2.4, 0.3).max() == 0
+    assert draw_ridges(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), 20, 30).shape == (20, 30)
