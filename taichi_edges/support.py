@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from taichi_edges.cameras import inside_image
+from taichi_edges.cameras import NEAR, inside_image
 
 OWNER_ROUNDS = 4  # owners whose own support turns out weak lose their pixels in the next round
 CLAIM = 0.8  # a point claims the pixels within this many line widths of its projection
@@ -41,7 +41,8 @@ def line_width(views, threshold):
     width = max(4.0 * distances / max(pixels, 1) - 2.0, 1.0)
     middle = views.box.mean(axis=0, keepdims=True)
     depths = np.array([views.project(middle, view)[1][0] for view in range(len(views))])
-    return float(width), float(width * np.median(depths / views.intrinsics[:, 0, 0]))
+    in_front = np.maximum(depths, NEAR)  # a view that looks away says nothing about the scale
+    return float(width), float(width * np.median(in_front / views.intrinsics[:, 0, 0]))
 
 
 def exclusive_support(views, points, threshold):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import taichi as ti
 from reference_splatting import (
-    INSIDE, NO_EDGES, OBLIQUE, OUTSIDE, PARAMETERS, alphas, gradient, image_loss, orient_loss, project, random_gaussians,
-    random_scene, shape_loss, slope,
+    INSIDE, NO_EDGES, OBLIQUE, OUTSIDE, PARAMETERS, alphas, gradient, image_loss, orient_loss, project,
+    random_gaussians, random_scene, shape_loss, slope,
 )
 
 from taichi_edges.splatting.gaussians import Gaussians
@@ -17,8 +17,8 @@ WIDTH, HEIGHT, NEIGHBORS = 50, 40, 4
 VIEWS = (OUTSIDE, OBLIQUE, INSIDE)
 
 # Of a group's largest derivative. The twin's derivatives are exact (complex steps), so only rounding is left: 1e-16 in
-# f64 and 6e-8 in f32, times up to 1e3 for the determinant of a needle (see test_splatting.py), times 1e3 for 1 / (1 - a)
-# at a = 0.999 in f64; in f32 the Gaussians have no such alphas.
+# f64 and 6e-8 in f32, times up to 1e3 for the determinant of a needle (see test_splatting.py), times 1e3 for
+# 1 / (1 - a) at a = 0.999 in f64; in f32 the Gaussians have no such alphas.
 TOLERANCE = {"f64": 1e-9, "f32": 2e-4}
 
 

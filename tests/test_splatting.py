@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+import taichi as ti
 from reference_splatting import (
     INSIDE, MOSTLY_EDGES, NO_EDGES, OBLIQUE, OUTSIDE, PARAMETERS, Scene, alphas, image_loss, project, random_gaussians,
     random_scene, render,
 )
 
 from taichi_edges.splatting.gaussians import Gaussians, rotation_matrices, start_gaussians
-from taichi_edges.splatting.splat import pack_mask
+from taichi_edges.splatting.splat import fast_exp, pack_mask
 
 WIDTH, HEIGHT = 50, 40
 VIEWS = (OUTSIDE, OBLIQUE, INSIDE)
@@ -272,3 +273,22 @@ def test_direction_is_the_axis_of_the_largest_scale(generator):
     largest = np.linalg.eigh(covariances)[1][:, :, 2]
     # Eigenvectors turn by rounding / gap of the eigenvalues; among 50 random Gaussians gaps of 1e-6 do not occur.
     np.testing.assert_allclose(np.abs((largest * gaussians.directions()).sum(axis=1)), 1, atol=1e-9)
+
+
+def test_fast_exp_is_exp_to_single_precision(start_taichi):
+    start_taichi("f32", 2)
+
+    @ti.kernel
+    def evaluate(x: ti.types.ndarray(dtype=ti.f32, ndim=1), y: ti.types.ndarray(dtype=ti.f32, ndim=1)):
+        for i in range(x.shape[0]):
+            y[i] = fast_exp(x[i])
+
+    exponents = np.linspace(-5.6, 0, 100_001, dtype=np.float32)  # exp(-5.6) is less than 1/255: no more is drawn
+    values = np.empty_like(exponents)
+    evaluate(exponents, values)
+    # The polynomial's 1e-7; half a unit in the last place of x * log2(e), at most 8, times ln 2: 1.7e-7; as much again
+    # for the rounding of log2(e) itself; and two roundings at the end.
+    np.testing.assert_allclose(values, np.exp(exponents.astype(np.float64)), rtol=1e-7 + 2 * 1.7e-7 + 2 * 6e-8)
+    values = np.empty(2, np.float32)
+    evaluate(np.array([-80.0, -1e30], np.float32), values)
+    np.testing.assert_allclose(values, np.exp(-80.0), rtol=1e-5)

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from taichi_edges.progress import Progress
 from taichi_edges.scene import DensityConfig, TrainConfig
-from taichi_edges.splatting.density import Population, cull_opacity, cull_support, duplicate, thin
+from taichi_edges.splatting.density import Population, cull_opacity, cull_support, duplicate
 from taichi_edges.splatting.gaussians import Gaussians, logit, start_gaussians
 from taichi_edges.splatting.seeding import random_points
 from taichi_edges.splatting.training import Training, nearest_neighbors, rates
@@ -64,18 +64,9 @@ def test_gaussians_off_the_edges_are_culled_with_their_moments(block, generator)
     culled = cull_support(numbered_population(np.concatenate([on, off])), views, 0.3, 0.5)
     kept = culled.positional_gradients.astype(int) - 1
     assert_kept(culled, kept)
-    # Most edges are seen from at least half of the views; a stray point falls on the lines (7 % of the pixels) by chance.
+    # Most edges are seen from at least half of the views; a stray point falls on the lines, 7 % of the pixels, by chance.
     assert (kept < len(on)).sum() > 0.7 * len(on)
     assert (kept >= len(on)).sum() < 0.2 * len(off)
-
-
-def test_thinning_keeps_the_strongest_of_a_neighbourhood(block):
-    views, edges = block
-    centre = edges[np.argmax(views.edge_support(edges)[0])]
-    # On an edge that many views see; half a pixel beside it; alone in empty space.
-    population = numbered_population([centre, centre + 0.75 * PIXEL, [0.02, 0.02, 0.98]])
-    assert_kept(thin(population, views, 2 * PIXEL, 0.9), [0, 2])
-    assert_kept(thin(population, views, 0.5 * PIXEL, 0.9), [0, 1, 2])  # too far apart to compete
 
 
 def test_duplicates_stand_near_their_source_with_moments_of_zero(generator):
@@ -155,7 +146,8 @@ def test_the_last_neighbour_repeats_where_there_are_too_few(generator, count):
     distances = np.linalg.norm(points[:, None] - points[neighbors], axis=2)
     expected = brute_force_distances(points, count - 1)
     np.testing.assert_allclose(distances[:, : count - 1], expected, rtol=1e-12)
-    np.testing.assert_array_equal(neighbors[:, count - 1 :], np.repeat(neighbors[:, count - 2, None], 5 - count, axis=1))
+    repeated = np.repeat(neighbors[:, count - 2, None], 5 - count, axis=1)
+    np.testing.assert_array_equal(neighbors[:, count - 1 :], repeated)
 
 
 # Schedule -------------------------------------------------------------------------------------------------------------

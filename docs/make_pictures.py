@@ -1,0 +1,67 @@
+"""Makes the README's pictures from finished runs: `python docs/make_pictures.py RUN_FOLDER VIEW OUT.png`.
+
+Panels of one view, cropped to the scene: the edge map the training saw, the oriented points coloured by cluster, and
+the edges over the view's picture. Edge maps and pictures are shown only where the run has rendered them itself.
+"""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from taichi_edges.edges.edge_set import read_edges
+from taichi_edges.exporters.overlays import background, draw_edges
+from taichi_edges.exporters.palette import label_colours
+from taichi_edges.views import read_views
+
+PANEL = 420  # px
+MARGIN = 0.08  # of the panel, around the edges
+
+
+def crop_of(pixels, size):
+    """(left, top, side) of the square around the pixels, with a margin, inside an image of `size` (width, height)."""
+    low, high = np.nanmin(pixels, axis=0), np.nanmax(pixels, axis=0)
+    side = int(np.ceil((high - low).max() * (1 + 2 * MARGIN)))
+    left, top = np.clip(((low + high) / 2 - side / 2).astype(int), 0, np.maximum(np.array(size) - side, 0))
+    return left, top, side
+
+
+def draw_points(shape, pixels, colours):
+    """White picture with a dot at each of the (n, 2) pixels."""
+    picture = np.full((*shape, 3), 255, np.uint8)
+    for (u, v), colour in zip(pixels, colours, strict=True):
+        if np.isfinite(u + v):
+            centre = (round(u * 16), round(v * 16))
+            cv2.circle(picture, centre, 22, [int(c) for c in colour[::-1]], -1, cv2.LINE_AA, 4)
+    return picture
+
+
+def main(folder, view_name, out):
+    """Write the picture of one view of the run in `folder`."""
+    folder = Path(folder)
+    views = read_views(folder / "views.npz")
+    view = views.names.index(view_name)
+    edges = read_edges(folder / "edges.json")[0].transformed(views.similarity.to_unit)
+    with np.load(folder / "clusters.npz") as clusters:
+        points, labels = clusters["points"], clusters["labels"]
+    shape = (views.height, views.width)
+    edge_map = cv2.cvtColor(255 - views.edge_maps[view], cv2.COLOR_GRAY2BGR)
+    dots = draw_points(shape, views.project(points, view)[0], label_colours(labels))
+    own_picture = folder / "images" / f"{view_name}.png"
+    if own_picture.exists():
+        canvas = background(replace(views, image_paths=(str(own_picture),) * len(views)), view)
+    else:
+        canvas = np.full((*shape, 3), 255, np.uint8)
+    drawn = draw_edges(canvas, views.intrinsics[view] @ views.world_to_camera[view], edges)
+    left, top, side = crop_of(views.project(edges.sample(0.01)[0], view)[0], (views.width, views.height))
+    panels = [image[top : top + side, left : left + side] for image in (edge_map, dots, drawn)]
+    panels = panels if own_picture.exists() else panels[1:]
+    cv2.imwrite(out, np.hstack([cv2.resize(panel, (PANEL, PANEL), interpolation=cv2.INTER_AREA) for panel in panels]))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
