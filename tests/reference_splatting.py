@@ -165,3 +165,14 @@ def random_gaussians(count, generator, large=0):
     arrays[1][:large] += np.log(0.6) - low  # 40 px: the blur takes less than 0.0002 off the opacity of 0.9998
     arrays[3][:large] = 8.5
     return Gaussians(*(array.astype(np.float32).astype(np.float64) for array in arrays))
+
+
+# What a Splatter has chosen ------------------------------------------------------------------------------------------
+
+
+def selected(splatter):
+    """Columns and rows (p, 2), weights and targets (p,) of the selected pixels."""
+    selection = splatter.selection
+    rows, columns = np.divmod(selection.pixels.to_numpy()[: selection.count], selection.width)
+    weights, targets = (field.to_numpy()[: selection.count] for field in (selection.weights, selection.targets))
+    return np.stack([columns, rows], axis=1), weights, targets

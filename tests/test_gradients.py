@@ -7,7 +7,7 @@ import pytest
 import taichi as ti
 from reference_splatting import (
     INSIDE, NO_EDGES, OBLIQUE, OUTSIDE, PARAMETERS, alphas, gradient, image_loss, orient_loss, project,
-    random_gaussians, random_scene, shape_loss, slope,
+    random_gaussians, random_scene, selected, shape_loss, slope,
 )
 
 from taichi_edges.splatting.gaussians import Gaussians
@@ -20,14 +20,6 @@ VIEWS = (OUTSIDE, OBLIQUE, INSIDE)
 # f64 and 6e-8 in f32, times up to 1e3 for the determinant of a needle (see test_splatting.py), times 1e3 for
 # 1 / (1 - a) at a = 0.999 in f64; in f32 the Gaussians have no such alphas.
 TOLERANCE = {"f64": 1e-9, "f32": 2e-4}
-
-
-def selected(splatter):
-    """Columns and rows (p, 2), weights and targets (p,) of the selected pixels."""
-    selection = splatter.selection
-    rows, columns = np.divmod(selection.pixels.to_numpy()[: selection.count], selection.width)
-    weights, targets = (field.to_numpy()[: selection.count] for field in (selection.weights, selection.targets))
-    return np.stack([columns, rows], axis=1), weights, targets
 
 
 def gradients(splatter):
@@ -94,8 +86,8 @@ def test_hand_adjoint_equals_taichis_own(open_splatter, seed, generator, view):
         splatter.select_pixels(view, 2)
         record(view)
         results.append((splatter.selection.transmittance.to_numpy()[: splatter.selection.count], gradients(splatter)))
-    # A product against a sum of logarithms of some 100 factors: the rounding of 1e-16 for each of them. In the gradients
-    # times up to 1e3 for 1 / (1 - a), times up to 1e3 in the projection of needles.
+    # A product against a sum of logarithms of some 100 factors: the rounding of 1e-16 for each of them. In the
+    # gradients times up to 1e3 for 1 / (1 - a), times up to 1e3 in the projection of needles.
     np.testing.assert_allclose(results[0][0], results[1][0], rtol=1e-12, atol=1e-300)
     assert_gradients(results[0][1], results[1][1], 1e-10)
 
@@ -127,7 +119,7 @@ def test_gaussians_that_are_not_drawn_have_gradients_of_zero(open_splatter, seed
     """Behind the camera, beside the image, too faint, too small: 0, not NaN, which Adam would never get rid of."""
     scene = random_scene(seed, WIDTH, HEIGHT)
     splatter = open_splatter(scene)
-    means = np.array([[0.5, -3.0, 1.5], [0.4, -1.0, 0.8], [3.0, 0.5, 0.5], [0.5, 0.5, 0.5], [0.5, 0.5, 0.5], [0.5, 0.5, 0.5]])
+    means = np.array([[0.5, -3.0, 1.5], [0.4, -1.0, 0.8], [3.0, 0.5, 0.5], *np.full((3, 3), 0.5)])
     scales, logits = np.full((6, 3), 0.02), np.array([4.0, 4.0, 4.0, -6.0, -80.0, 2.0])
     scales[5] = 1e-5
     splatter.load(Gaussians(means, np.log(scales), np.tile([0.3, 0.1, -0.5, 0.2], (6, 1)), logits))
@@ -306,7 +298,8 @@ def test_complex_steps_agree_with_central_differences(seed, generator):
     """Of Gaussians so large that no pixel is near a cut and of targets that C cannot reach."""
     scene = random_scene(seed, WIDTH, HEIGHT)
     gaussians = random_gaussians(3, generator, large=3)
-    gaussians = replace(gaussians, means=generator.uniform(0.3, 0.7, (3, 3)), opacity_logits=generator.uniform(-1, 1, 3))
+    means, logits = generator.uniform(0.3, 0.7, (3, 3)), generator.uniform(-1, 1, 3)
+    gaussians = replace(gaussians, means=means, opacity_logits=logits)
     pixels = np.stack([generator.integers(0, WIDTH, 100), generator.integers(0, HEIGHT, 100)], axis=1)
     weights = generator.random(100)
     neighbors = np.array([[1, 2], [0, 2], [0, 1]])

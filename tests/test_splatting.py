@@ -5,7 +5,7 @@ import pytest
 import taichi as ti
 from reference_splatting import (
     INSIDE, MOSTLY_EDGES, NO_EDGES, OBLIQUE, OUTSIDE, PARAMETERS, Scene, alphas, image_loss, project, random_gaussians,
-    random_scene, render,
+    random_scene, render, selected,
 )
 
 from taichi_edges.splatting.gaussians import Gaussians, rotation_matrices, start_gaussians
@@ -30,14 +30,6 @@ def assert_image(image, gaussians, camera, real):
     lax = render(gaussians, camera, width, height, SLACK[real])
     assert np.isfinite(image).all()
     assert (image >= strict - TOLERANCE[real]).all() and (image <= lax + TOLERANCE[real]).all()
-
-
-def selected(splatter):
-    """Columns and rows (p, 2), weights and targets (p,) of the selected pixels."""
-    selection = splatter.selection
-    rows, columns = np.divmod(selection.pixels.to_numpy()[: selection.count], selection.width)
-    weights, targets = (field.to_numpy()[: selection.count] for field in (selection.weights, selection.targets))
-    return np.stack([columns, rows], axis=1), weights, targets
 
 
 # Images ---------------------------------------------------------------------------------------------------------------
@@ -222,8 +214,8 @@ def test_loss_is_the_twins(open_splatter, seed, generator, loss):
     for view in (*VIEWS, MOSTLY_EDGES):
         splatter.select_pixels(view, 3)
         splatter.record(view)
-        # A weighted mean of |C - target|, so no less exact than C.
-        assert splatter.loss[None] == pytest.approx(image_loss(gaussians, scene.camera(view), *selected(splatter)), abs=1e-11)
+        expected = image_loss(gaussians, scene.camera(view), *selected(splatter))
+        assert splatter.loss[None] == pytest.approx(expected, abs=1e-11)  # a mean of |C - target|: as exact as C
 
 
 def test_threshold_parts_edges_from_background_at_the_same_level_as_the_views(open_splatter):

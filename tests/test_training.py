@@ -64,7 +64,7 @@ def test_gaussians_off_the_edges_are_culled_with_their_moments(block, generator)
     culled = cull_support(numbered_population(np.concatenate([on, off])), views, 0.3, 0.5)
     kept = culled.positional_gradients.astype(int) - 1
     assert_kept(culled, kept)
-    # Most edges are seen from at least half of the views; a stray point falls on the lines, 7 % of the pixels, by chance.
+    # Most edges are seen from half of the views and more; a stray point is on a line, 7 % of the pixels, by chance.
     assert (kept < len(on)).sum() > 0.7 * len(on)
     assert (kept >= len(on)).sum() < 0.2 * len(off)
 

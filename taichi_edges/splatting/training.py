@@ -1,5 +1,6 @@
 """Training: the paper's schedule (3.1, 3.2 and supplement) over the view steps of a scene."""
 
+import gc
 import time
 from dataclasses import dataclass
 
@@ -28,6 +29,7 @@ def start_taichi(arch, threads, seed, cache):
 
     arch: 'cpu', 'cuda' or 'vulkan'. UserError where the machine does not have it.
     """
+    gc.collect()  # an ndarray of an earlier program that is freed later would take memory of the new one with it
     available = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
     ti.init(
         arch=available[arch],
@@ -65,7 +67,7 @@ def nearest_neighbors(points, k):
     own = np.arange(len(points))[:, None]
     # A point is its own nearest, but among coinciding points it need not come first: drop it wherever it stands.
     order = np.argsort(indices == own, axis=1, kind="stable")
-    others = np.take_along_axis(indices, order, axis=1)[:, :k]
+    others = np.take_along_axis(indices, order, axis=1)[:, : min(k, max(len(points) - 1, 1))]
     return others if others.shape[1] == k else np.pad(others, ((0, 0), (0, k - others.shape[1])), mode="edge")
 
 
