@@ -98,7 +98,7 @@ class FilterConfig(Section):
 
     min_opacity: Share = Field(0.2)
     min_support: Share = Field(0.05, description="share of the views that see a point and have an edge pixel there")
-    outlier_neighbors: Annotated[int, Field(ge=0)] = Field(10, description="statistical outliers: neighbours; 0: off")
+    outlier_neighbors: Annotated[int, Field(ge=0)] = Field(3, description="statistical outliers: neighbours; 0: off")
     outlier_deviations: Positive = Field(5.0, description="mean neighbour distance allowed, standard deviations")
 
 
