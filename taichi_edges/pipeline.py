@@ -52,7 +52,14 @@ STAGES = {
     "prepare": Stage(
         stages.prepare, ("source", "box", "seed", "train.edge_threshold"), (), ("views.npz",), stages.source_files
     ),
-    "train": Stage(stages.train, ("train", "seed"), ("views.npz",), ("gaussians.ply", "train_log.csv"), on_device=True),
+    "train": Stage(
+        stages.train,
+        ("train", "seed"),
+        ("views.npz",),
+        ("gaussians.ply", "train_log.csv"),
+        stages.seed_files,
+        on_device=True,
+    ),
     "cluster": Stage(
         stages.cluster,
         ("filter", "cluster", "train.edge_threshold"),

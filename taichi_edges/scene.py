@@ -37,6 +37,7 @@ class SourceConfig(Section):
     images: str = Field("", description="folder of the colour images inside `path`; optional, for the overlays")
     split: str = Field("train", description="nerf: which transforms_<split>.json")
     axes: Literal["auto", "opengl", "opencv"] = Field("auto", description="camera axes; auto: what the layout means")
+    points: str = Field("", description="point cloud to start from with train.seeds: points; relative to the data root")
     thin: bool = Field(True, description="reduce the lines of the edge maps to their ridges and redraw them thin")
     thin_threshold: Share = Field(0.3, description="of full scale; ridges of the edge maps below are dropped")
     skip: list[str] = Field([], description="names of views to leave out")
@@ -74,7 +75,7 @@ class TrainConfig(Section):
 
     epochs: Count = Field(500, description="passes over all views")
     gaussians: Count = Field(10_000, description="number of random points to start from")
-    seeds: Literal["random", "points"] = Field("random", description="random points in the box, or the source's own")
+    seeds: Literal["random", "points"] = Field("random", description="random points in the box, or source.points")
     initial_scale: Positive = Field(0.004, description="standard deviation, unit-cube units")
     initial_opacity: Annotated[float, Field(gt=0, lt=1)] = Field(0.08)
     edge_threshold: Share = Field(0.5, description="of full scale; from here on a pixel is an edge pixel")

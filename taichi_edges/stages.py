@@ -38,7 +38,21 @@ def prepare(run):
     views = build_views(READERS[source.reader](folder, source), source, run.config.box, run.progress)
     views, facts = _with_thin_lines(views, source, run.config.train.edge_threshold)
     write_views(run.path("views.npz"), views)
-    return {"views": len(views), "width_px": views.width, "height_px": views.height, **facts}
+    size = {"width_px": views.width, "height_px": views.height}
+    return {"views": len(views), **size, **facts, "files": _copy_points(run)}
+
+
+def _copy_points(run):
+    """The points the scene names, those inside the box, to `seeds.ply`. Returns the names of the files written."""
+    if not run.config.source.points:
+        run.path("seeds.ply").unlink(missing_ok=True)  # of an older run with other settings
+        return []
+    from taichi_edges.exporters.ply import write_float_vertices
+    from taichi_edges.readers.points import read_points
+
+    points = read_points(run.data_path(run.config.source.points, "source.points"), run.config.box)
+    write_float_vertices(run.path("seeds.ply"), ("x", "y", "z"), points)
+    return ["seeds.ply"]
 
 
 def _with_thin_lines(views, source, edge_threshold):
@@ -77,23 +91,20 @@ def _prepare_synthetic(run):
     write_edges(run.path("truth.json"), part.edges, {"part": part.name})
     write_views(run.path("views.npz"), views)
     size = {"width_px": views.width, "height_px": views.height}
-    return {"views": len(views), **size, **facts, "part": part.name, "files": ["truth.json", *files]}
+    return {"views": len(views), **size, **facts, "part": part.name, "files": ["truth.json", *files, *_copy_points(run)]}
 
 
 def train(run):
     """`views.npz` -> `gaussians.ply` (input frame) and `train_log.csv`."""
     from taichi_edges.exporters.splats import write_gaussians
     from taichi_edges.splatting.gaussians import start_gaussians
-    from taichi_edges.splatting.seeding import random_points
     from taichi_edges.splatting.training import Training, start_taichi
 
     config, views = run.config.train, read_views(run.path("views.npz"))
-    if config.seeds == "points":
-        raise UserError(f"train.seeds: the {run.config.source.reader} reader brings no points; set it to random")
     generator = np.random.default_rng(run.config.seed)
     with contextlib.redirect_stdout(io.StringIO()):  # ti.init announces itself with a bare print
         start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)
-    points = random_points(config.gaussians, views.box, generator)
+    points = _start_points(run, views, generator)
     start = start_gaussians(points, generator, config.initial_scale, config.initial_opacity)
     training = Training(views, config, generator, run.threads, run.arch)
     gaussians, records = training.run(start, run.progress)
@@ -110,6 +121,25 @@ def train(run):
     )
     loss = records[-1].loss if np.isfinite(records[-1].loss) else None  # an epoch may have measured none
     return {"gaussians": len(gaussians), "view_steps": training.step, "final_loss": loss}
+
+
+def _start_points(run, views, generator):
+    """(n, 3) unit-cube points to start from: random ones, or those of `seeds.ply`."""
+    from taichi_edges.exporters.ply import read_vertices, stack_fields
+    from taichi_edges.splatting.seeding import given_points, random_points
+
+    config = run.config.train
+    if config.seeds == "random":
+        return random_points(config.gaussians, views.box, generator)
+    if not run.path("seeds.ply").exists():
+        raise UserError("train.seeds: points need a file to come from; name it in source.points, or set seeds to random")
+    given = stack_fields(read_vertices(run.path("seeds.ply"), ("x", "y", "z")), ("x", "y", "z"))
+    return given_points(views.similarity.to_unit(given.astype(np.float64)), config.gaussians, generator)
+
+
+def seed_files(run):
+    """The points that training starts from, where the scene names some."""
+    return [run.path("seeds.ply")] if run.config.source.points else []
 
 
 def _write_csv(path, rows):
@@ -217,13 +247,14 @@ def export(run):
 def source_files(run):
     """Every file the prepare stage reads, so that a changed input is noticed."""
     source = run.config.source
+    points = [run.data_path(source.points, "source.points")] if source.points else []
     if source.reader == "synthetic":
-        return []
+        return points
     from taichi_edges.readers import READERS
 
     frames = READERS[source.reader](run.data_path(source.path, "source.path"), source)
     paths = [Path(path) for path in (*frames.edge_paths, *frames.image_paths) if path]
-    return [frames.where, *sorted({path for path in paths if path.is_file()})]
+    return [frames.where, *sorted({path for path in paths if path.is_file()}), *points]
 
 
 def truth_files(run):

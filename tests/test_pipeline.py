@@ -14,6 +14,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from taichi_edges.artefacts import remove_unfinished, replacing
@@ -22,7 +23,9 @@ from taichi_edges.errors import UserError
 from taichi_edges.findings import FINDINGS
 from taichi_edges.pipeline import STAGES, Run, run_stages
 from taichi_edges.progress import PlainProgress, TerminalProgress
+from taichi_edges.readers.points import read_points
 from taichi_edges.scene import load_scene
+from taichi_edges.splatting.seeding import given_points
 from taichi_edges.views import read_views
 
 ROOT = Path(__file__).parent.parent
@@ -384,6 +387,28 @@ def test_an_unknown_part_is_refused(copied):
 
 def test_seeds_that_the_source_does_not_have_are_refused(copied):
     assert "train.seeds" in refused(copied, settings=["train.seeds=points"])
+
+
+def write_cloud(path, points):
+    """An ASCII PLY as any other program writes it."""
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\nproperty float x\nproperty float y\nproperty float z\n"
+    path.write_text(header + "end_header\n" + "".join(f"{x} {y} {z}\n" for x, y, z in points))
+    return path
+
+
+def test_given_points_inside_the_box_become_the_seeds(tmp_path):
+    points = [(0.5, 0.5, 0.5), (0.25, 0.5, 0.75), (5.0, 0.5, 0.5)]
+    cloud = write_cloud(tmp_path / "cloud.ply", points)
+    assert read_points(cloud, [[0, 0, 0], [1, 1, 1]]).tolist() == [list(point) for point in points[:2]]
+    assert len(given_points(np.array(points), 2, np.random.default_rng(0))) == 2
+
+
+def test_given_points_are_refused_when_there_is_none_to_use(copied, tmp_path):
+    cloud = write_cloud(tmp_path / "cloud.ply", [(5.0, 0.5, 0.5)])
+    empty = write_cloud(tmp_path / "empty.ply", [])
+    assert "none of the 1 points" in refused(copied, settings=[f"source.points={cloud}"])
+    assert "holds no points" in refused(copied, settings=[f"source.points={empty}"])
+    assert "does not exist" in refused(copied, settings=[f"source.points={tmp_path}/nowhere.ply"])
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,8 @@ def random_points(count, box, generator):
     return box[0] + generator.random((count, 3)) * (box[1] - box[0])
 
 
-def given_points(points, count, box, generator):
-    """At most `count` of the given points (n, 3) that lie in the box, drawn without repetition where there are more."""
-    points = points[((points >= box[0]) & (points <= box[1])).all(axis=1)]
+def given_points(points, count, generator):
+    """At most `count` of the (n, 3) given points, drawn without repetition where there are more."""
     if len(points) <= count:
         return points
     return points[np.sort(generator.choice(len(points), count, replace=False))]
