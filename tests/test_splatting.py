@@ -9,7 +9,8 @@ from reference_splatting import (
 )
 
 from taichi_edges.splatting.gaussians import Gaussians, rotation_matrices, start_gaussians
-from taichi_edges.splatting.splat import fast_exp, pack_mask
+from taichi_edges.splatting.selection import pack_mask
+from taichi_edges.splatting.splat import fast_exp
 
 WIDTH, HEIGHT = 50, 40
 VIEWS = (OUTSIDE, OBLIQUE, INSIDE)

@@ -7,7 +7,8 @@ from taichi_edges.splatting.gaussians import GaussianFields, round_capacity
 from taichi_edges.splatting.losses import NeighborFields, make_image_loss, make_regularizers
 from taichi_edges.splatting.optimizer import BETA1, BETA2, make_adam
 from taichi_edges.splatting.projection import CameraFields, SplatFields, make_project
-from taichi_edges.splatting.splat import PixelSelection, make_select, make_splat, pack_mask
+from taichi_edges.splatting.selection import PixelSelection, make_select, pack_mask
+from taichi_edges.splatting.splat import make_splat
 
 LOSSES = ("balanced", "class_weighted", "whole_image")  # eq. 3 first; the other two are the options the paper names
 GPU_ARCHS = ("cuda", "vulkan", "metal", "opengl")
