@@ -8,9 +8,17 @@ import sys
 STAGES = ("prepare", "train", "cluster", "fit", "evaluate", "export")
 
 
+class OneLineParser(argparse.ArgumentParser):
+    """Says what is wrong with the command line in one line, without the usage before it."""
+
+    def error(self, message):
+        """Exit with status 2."""
+        self.exit(2, f"error: {message}; see {self.prog} --help\n")
+
+
 def parse_arguments(arguments=None):
     """The command line; kept free of heavy imports so that --help answers at once."""
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         description="Recover the 3D edges of a scene: prepare, train, cluster, fit, evaluate, export.",
         epilog="A stage that is up to date is skipped, so the same command resumes an interrupted run.",
     )

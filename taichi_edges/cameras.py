@@ -64,6 +64,11 @@ def inside_image(pixels, width, height):
         return (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
 
 
+def transform(matrix, points):
+    """(n, 3) points through a (4, 4) affine matrix."""
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
 def invert_pose(camera_to_world):
     """(..., 4, 4) or (..., 3, 4) rigid camera-to-world -> (..., 3, 4) world-to-camera (or the other way round)."""
     rotation = np.swapaxes(camera_to_world[..., :3, :3], -1, -2)

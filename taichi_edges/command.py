@@ -4,9 +4,11 @@ import os
 from pathlib import Path
 
 from taichi_edges.errors import UserError
-from taichi_edges.pipeline import STAGES, Run, run_stages
+from taichi_edges.pipeline import STAGES, Run, expand, run_stages
 from taichi_edges.progress import make_progress
 from taichi_edges.scene import load_scene
+
+MOST_THREADS = 256  # each has an image of its own to draw into
 
 
 def run_command(options):
@@ -14,14 +16,10 @@ def run_command(options):
     config = load_scene(options.scene, options.preset, options.set, options.seed)
     if options.show and options.until and list(STAGES).index(options.until) < list(STAGES).index("fit"):
         raise UserError(f"--show needs the edges, but --until {options.until} stops before fit; leave one of them out")
-    data = options.data or os.environ.get("TAICHI_EDGES_DATA")
-    if data and not Path(data).expanduser().is_dir():
-        origin = "--data" if options.data else "TAICHI_EDGES_DATA"
-        raise UserError(f"{origin}: {data} is not a folder; name the folder that holds the scenes' data")
     run = Run(
         config=config,
         folder=Path(options.out) / config.name,
-        data_root=Path(data).expanduser().resolve() if data else None,
+        data_root=_data_root(options.data),
         threads=_threads(options.threads),
         arch=options.arch,
         progress=make_progress(options.quiet),
@@ -32,12 +30,24 @@ def run_command(options):
         show(run)
 
 
+def _data_root(option):
+    """The folder of --data, or else of TAICHI_EDGES_DATA; None where neither is given."""
+    origin, data = ("--data", option) if option else ("TAICHI_EDGES_DATA", os.environ.get("TAICHI_EDGES_DATA"))
+    if not data:
+        return None
+    folder = expand(data, origin)
+    if not folder.is_dir():
+        raise UserError(f"{origin}: {data} is not a folder; name the folder that holds the scenes' data")
+    return folder.resolve()
+
+
 def _threads(wanted):
     """Threads to use: what the user wants, or all that this process may use."""
     if wanted is None:
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if wanted < 1:
-        raise UserError(f"--threads {wanted}: must be at least 1")
+    if not 1 <= wanted <= MOST_THREADS:
+        bound = "at least 1" if wanted < 1 else f"at most {MOST_THREADS}"
+        raise UserError(f"--threads {wanted}: must be {bound}")
     return wanted
 
 

@@ -70,7 +70,7 @@ STAGES = {
     "evaluate": Stage(
         stages.evaluate, ("evaluation",), ("edges.json", "views.npz"), ("metrics.json", "metrics.csv"), stages.truth_files
     ),
-    "export": Stage(stages.export, (), ("edges.json", "views.npz"), ("overlays.png",)),
+    "export": Stage(stages.export, (), ("edges.json", "views.npz"), ("overlays.png",), stages.picture_files),
 }
 
 
@@ -100,7 +100,7 @@ class Run:
 
     def data_path(self, text, key):
         """A path of the scene: absolute, or relative to the data root. UserError where it does not exist."""
-        path = Path(text).expanduser()
+        path = expand(text, key)
         if not path.is_absolute():
             if self.data_root is None:
                 problem = f"{text} is relative to the data root, and there is none"
@@ -109,6 +109,14 @@ class Run:
         if not path.exists():
             raise UserError(f"{key}: {path} does not exist; correct {key}, --data or TAICHI_EDGES_DATA")
         return path
+
+
+def expand(text, origin):
+    """A path as the user wrote it, with `~` replaced; `origin` is where it was written, for the message."""
+    try:
+        return Path(text).expanduser()
+    except RuntimeError as error:
+        raise UserError(f"{origin}: {text}: '~' and what follows it name no user; write the path out") from error
 
 
 def run_stages(run, start=None, until=None):

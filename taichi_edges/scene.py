@@ -43,7 +43,7 @@ class SourceConfig(Section):
     skip: list[str] = Field([], description="names of views to leave out")
     part: str = Field("demo", description="synthetic: which of the generator's parts")
     views: Count = Field(30, description="synthetic: number of views")
-    size: Count = Field(400, description="synthetic: width and height of the views, pixels")
+    size: Annotated[int, Field(ge=16)] = Field(400, description="synthetic: width and height of the views, pixels")
 
 
 class LearningRates(Section):
@@ -78,7 +78,7 @@ class TrainConfig(Section):
     seeds: Literal["random", "points"] = Field("random", description="random points in the box, or source.points")
     initial_scale: Positive = Field(0.004, description="standard deviation, unit-cube units")
     initial_opacity: Annotated[float, Field(gt=0, lt=1)] = Field(0.08)
-    edge_threshold: Share = Field(0.5, description="of full scale; from here on a pixel is an edge pixel")
+    edge_threshold: Annotated[float, Field(gt=0, le=1)] = Field(0.5, description="of full scale; from here on a pixel is an edge pixel")
     loss: Literal["balanced", "class_weighted", "whole_image"] = Field("balanced", description="balanced is eq. 3")
     only_means_epochs: Annotated[int, Field(ge=0)] = Field(30, description="epochs that train positions only")
     learning_rates: LearningRates = LearningRates()
@@ -175,6 +175,8 @@ PRESETS = {
             "orient_weight": 0.1,
             "shape_weight": 0.1,
             "neighbors": 4,
+            # The paper leaves the intervals open; those in epochs belong to its 500 epochs.
+            "density": DensityConfig().model_dump(),
         }
     }
 }
@@ -214,6 +216,8 @@ def parse_yaml(text, where):
         place = f" line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "it holds control characters; is it a text file?"
         raise UserError(f"{where}:{place}{':' if place else ''} not valid YAML: {problem}") from error
+    except RecursionError as error:
+        raise UserError(f"{where}: not valid YAML: nested too deeply; is a bracket left open?") from error
 
 
 def merge(base, over):

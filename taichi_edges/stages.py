@@ -10,11 +10,13 @@ import csv
 import io
 import json
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from taichi_edges.artefacts import replacing, write_json, write_text
+from taichi_edges.cameras import transform
 from taichi_edges.edges.branches import separate_branches
 from taichi_edges.edges.clustering import grow_clusters
 from taichi_edges.edges.edge_set import read_edges, write_edges
@@ -211,10 +213,11 @@ def evaluate(run):
     if path is None:
         metrics = {"lines": len(edges.lines), "curves": len(edges.curves), "ground_truth": None}
     else:
-        to_truth = read_views(run.path("views.npz")).input_to_truth
-        moved = edges.transformed(lambda points: points @ to_truth[:3, :3].T + to_truth[:3, 3])
-        truth = read_ground_truth(path)
-        metrics = {**measure(moved, truth), "ground_truth": truth.source}
+        views = read_views(run.path("views.npz"))
+        to_truth, from_truth = views.input_to_truth, np.linalg.inv(views.input_to_truth)
+        truth = read_ground_truth(path, lambda points: views.similarity.to_unit(transform(from_truth, points)))
+        into_frame = partial(transform, to_truth) if truth.own_frame else views.similarity.to_unit
+        metrics = {**measure(edges.transformed(into_frame), truth), "ground_truth": truth.source}
     write_json(run.path("metrics.json"), metrics)
     _write_csv(run.path("metrics.csv"), [("metric", "value"), *metrics.items()])
     return metrics
@@ -242,6 +245,17 @@ def export(run):
     pictures = draw_overlays(run.path("overlays"), views, edges.transformed(views.similarity.to_unit))
     contact_sheet(pictures, run.path("overlays.png"))
     return {"files": [*written, "overlays.png", *(f"overlays/{path.name}" for path in pictures)]}
+
+
+def picture_files(run):
+    """The colour images that the overlays are drawn on; those of a synthetic scene are its own."""
+    source = run.config.source
+    if source.reader == "synthetic" or not source.images:
+        return []
+    from taichi_edges.readers import READERS
+
+    frames = READERS[source.reader](run.data_path(source.path, "source.path"), source)
+    return [Path(path) for path in frames.image_paths if Path(path).is_file()]
 
 
 def source_files(run):

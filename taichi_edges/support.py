@@ -36,6 +36,8 @@ def line_width(views, threshold):
     distances, pixels = 0.0, 0
     for edge_map in views.edge_maps:
         edges = (edge_map >= threshold * 255).astype(np.uint8)
+        if edges.all():  # no line, and no distance to measure
+            continue
         distances += float(cv2.distanceTransform(edges, cv2.DIST_L2, 5).sum())
         pixels += int(edges.sum())
     width = max(4.0 * distances / max(pixels, 1) - 2.0, 1.0)

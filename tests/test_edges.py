@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from taichi_edges.edges.bezier import (
-    LENGTH_SEGMENTS, bernstein, bezier_derivative, bezier_lengths, evaluate_bezier, split_bezier,
+    LENGTH_SEGMENTS, bernstein, bezier_lengths, evaluate_bezier,
 )
 from taichi_edges.edges.clustering import UNASSIGNED, grow_clusters
 from taichi_edges.edges.edge_set import EdgeSet, read_edges, write_edges
@@ -329,20 +329,6 @@ def test_bezier_points_match_de_casteljau(generator):
         evaluate_bezier(control, parameters), [de_casteljau(control, t) for t in parameters], atol=1e-12
     )
     np.testing.assert_allclose(bernstein(parameters).sum(axis=1), 1.0)
-
-
-def test_bezier_derivative_matches_finite_differences(generator):
-    control, parameters, step = generator.normal(size=(4, 3)), generator.random(20), 1e-6
-    differences = evaluate_bezier(control, parameters + step) - evaluate_bezier(control, parameters - step)
-    np.testing.assert_allclose(bezier_derivative(control, parameters), differences / (2 * step), atol=1e-6)
-
-
-def test_bezier_halves_follow_the_whole(generator):
-    control, at = generator.normal(size=(4, 3)), generator.uniform(0.1, 0.9)
-    left, right = split_bezier(control, at)
-    t = np.linspace(0, 1, 11)
-    np.testing.assert_allclose(evaluate_bezier(left, t), evaluate_bezier(control, at * t), atol=1e-12)
-    np.testing.assert_allclose(evaluate_bezier(right, t), evaluate_bezier(control, at + (1 - at) * t), atol=1e-12)
 
 
 def test_bezier_lengths_are_sums_of_chords(generator):

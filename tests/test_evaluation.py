@@ -380,6 +380,16 @@ def test_plate_as_its_own_prediction_gives_its_floor(data):
 # ------------------------------------------------------------------------------------------- files, and mistakes
 
 
+def test_a_truth_in_other_units_is_scored_in_the_unit_cube(tmp_path):
+    edges = EdgeSet(np.array([line([0, 0, 0], [1, 0, 0])]), circle_pieces(4), np.array([0]), np.array([1, 1, 1, 1]))
+    in_mm = edges.transformed(lambda points: 1000 * points - 500)
+    path = write_edges(tmp_path / "edges.json", in_mm, {})
+    truth = read_ground_truth(path, lambda points: (points + 500) / 1000)
+    assert truth.length == pytest.approx(1 + 2 * np.pi * 0.2, rel=1e-3)
+    shifted = edges.transformed(lambda points: points + [0, 0, 0.003])
+    assert evaluate(shifted, truth)["accuracy_mm"] == pytest.approx(3.0, abs=0.3)
+
+
 def test_an_edge_file_of_ours_is_a_truth(tmp_path):
     edges = EdgeSet(np.array([line([0, 0, 0], [1, 0, 0])]), circle_pieces(4), np.array([0]), np.array([1, 1, 1, 1]))
     truth = read_ground_truth(write_edges(tmp_path / "edges.json", edges, {"units": "input", "edges": 2}))

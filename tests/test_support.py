@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from taichi_edges.detectors.ridges import draw_ridges
-from taichi_edges.support import edge_strength, exclusive_support
+from taichi_edges.support import edge_strength, exclusive_support, line_width
 from taichi_edges.synthetic.rendering import ring_cameras
 from taichi_edges.views import Views
 
@@ -62,3 +62,11 @@ def test_points_no_view_sees_have_neither_strength_nor_support():
     far = np.array([[0.5, 0.5, 50.0], [100.0, 0.0, 0.0]])
     assert edge_strength(views, far) == pytest.approx([0, 0])
     assert exclusive_support(views, far, 0.5) == pytest.approx([0, 0])
+
+
+def test_a_map_without_background_does_not_count_for_the_width_of_the_lines():
+    views = scene(A)
+    maps = views.edge_maps.copy()
+    maps[0] = 255
+    whitened = Views(views.names, maps, views.intrinsics, views.world_to_camera, views.image_paths)
+    assert line_width(whitened, 0.5)[0] == pytest.approx(line_width(views, 0.5)[0], rel=0.05)

@@ -5,8 +5,9 @@ ABC folder     `*_features_*.yml` (the CAD curves), `*_trimesh_*.obj` (their ver
 Sampled PLY    points only: the curves and their length stay unknown.
 Edge file      EMAP's keys (`read_edges`), or a list `edges` of {edge, kind: line or bezier, p: control points}.
 
-The truth frame is the unit cube for ABC (x_norm = x_raw * s + 0.5 - s * centre, s = 1 / longest side of the box); a
-PLY or an edge file is taken as it is.
+An ABC folder defines a normalised frame of its own (x_norm = x_raw * s + 0.5 - s * centre, s = 1 / longest side of the
+model's bounding box). A PLY or an edge file is in the truth frame of the scene, and comes into the scene's unit cube by
+the function `to_unit`, so that a "mm" means the same whatever the units of the input.
 """
 
 import json
@@ -29,13 +30,14 @@ MALFORMED = (KeyError, IndexError, TypeError, ValueError, AttributeError)
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """The true edges, in the truth frame.
+    """The true edges, in a normalised frame: the model's own (`own_frame`), or the unit cube of the scene.
 
     points: (n, 3) float64 samples, what a prediction is scored against.
     curves: tuple of (m, 3) polylines, one for each true edge; empty where only samples are known.
     kinds:  tuple of 'line' or 'curve', one for each polyline.
     length: total length in normalised units, or None where only samples are known.
     source: what was read, in words.
+    own_frame: predictions go into the truth frame of the scene to be compared; otherwise into its unit cube.
     """
 
     points: np.ndarray
@@ -43,10 +45,19 @@ class GroundTruth:
     kinds: tuple
     length: float | None
     source: str
+    own_frame: bool = False
 
 
-def read_ground_truth(path):
-    """Read the ground truth at `path`: an ABC folder, a sampled `.ply` or an edge `.json`. Returns a GroundTruth."""
+def as_it_is(points):
+    """(n, 3) points that are normalised already."""
+    return points
+
+
+def read_ground_truth(path, to_unit=as_it_is):
+    """Read the ground truth at `path`: an ABC folder, a sampled `.ply` or an edge `.json`. Returns a GroundTruth.
+
+    to_unit: affine function (n, 3) -> (n, 3) from the scene's truth frame to its unit cube, for `.ply` and `.json`.
+    """
     path = Path(path)
     if path.is_dir():
         return read_abc(path)
@@ -54,7 +65,7 @@ def read_ground_truth(path):
         raise UserError(f"{path}: no such ground truth; give an ABC folder, a sampled .ply or an edge .json")
     if path.suffix.lower() not in FILE_READERS:
         raise UserError(f"{path}: not a ground truth; give an ABC folder, a sampled .ply or an edge .json")
-    return FILE_READERS[path.suffix.lower()](path)
+    return FILE_READERS[path.suffix.lower()](path, to_unit)
 
 
 def polyline_length(polyline):
@@ -82,7 +93,7 @@ def read_abc(folder):
         raise UserError(f"{features}: every mesh segment is shorter than {ABC_SPACING} CAD units; give a sampled .ply")
     curves = tuple(frame.to_unit(polyline) for polyline in raw)
     kinds = tuple("line" if curve["type"] == "Line" else "curve" for curve in sharp)
-    return GroundTruth(frame.to_unit(points), curves, kinds, sum(map(polyline_length, curves)), source)
+    return GroundTruth(frame.to_unit(points), curves, kinds, sum(map(polyline_length, curves)), source, own_frame=True)
 
 
 def only_file(folder, pattern):
@@ -206,19 +217,22 @@ def sample_mesh_segments(polyline):
 # ---------------------------------------------------------------------------------------------------- single files
 
 
-def read_sampled_ply(path):
-    """A point cloud as the truth: no curves, no length."""
+def read_sampled_ply(path, to_unit=as_it_is):
+    """A point cloud as the truth: no curves, no length. to_unit: as in `read_ground_truth`."""
     import open3d
 
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         points = np.asarray(open3d.io.read_point_cloud(str(path)).points, dtype=np.float64)
     if not len(points) or not np.isfinite(points).all():
         raise UserError(f"{path}: no readable points in it; give a PLY with x, y, z of every sample")
-    return GroundTruth(points, (), (), None, f"sampled points of {path.name}")
+    return GroundTruth(to_unit(points), (), (), None, f"sampled points of {path.name}")
 
 
-def read_edge_file(path):
-    """An edge file as the truth, of EMAP's kind or with a list `edges`, sampled every EDGE_FILE_SPACING."""
+def read_edge_file(path, to_unit=as_it_is):
+    """An edge file as the truth, of EMAP's kind or with a list `edges`, sampled every EDGE_FILE_SPACING.
+
+    to_unit: as in `read_ground_truth`.
+    """
     content = read_json(path, "edges")
     if isinstance(content, dict) and {"lines_end_pts", "curves_ctl_pts"} & content.keys():
         edges = read_edges(path)[0]  # first, for a file of ours may have a key `edges` as well: their number
@@ -230,6 +244,7 @@ def read_edge_file(path):
         raise UserError(f"{path}: line_sources and curve_sources do not match the edges; remove both of them")
     if not len(edges) or not all(np.isfinite(part).all() for part in (edges.lines, edges.curves)):
         raise UserError(f"{path}: no edge in it, or one that is not finite; a ground truth needs edges")
+    edges = edges.transformed(to_unit)
     curves, kinds = join_pieces(edges)
     points = edges.sample(EDGE_FILE_SPACING)[0]
     return GroundTruth(points, curves, kinds, float(edges.lengths.sum()), f"edges of {path.name}")

@@ -41,6 +41,8 @@ def _input_to_truth(content, where):
     values = matrix(content.get("worldtogt", np.eye(4)), (4, 4), where, "worldtogt")
     if not np.isfinite(values).all():
         raise UserError(f"{where}: worldtogt holds values that are not finite; correct it or leave it out")
+    if np.linalg.matrix_rank(values) < 4:
+        raise UserError(f"{where}: worldtogt cannot be inverted; correct it or leave it out")
     return values
 
 

@@ -11,7 +11,7 @@ from taichi_edges.splatting.selection import PixelSelection, make_select, pack_m
 from taichi_edges.splatting.splat import make_splat
 
 LOSSES = ("balanced", "class_weighted", "whole_image")  # eq. 3 first; the other two are the options the paper names
-GPU_ARCHS = ("cuda", "vulkan", "metal", "opengl")
+GPU_ARCHS = ("cuda", "vulkan")
 
 
 class EdgeImages:
