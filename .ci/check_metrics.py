@@ -12,7 +12,9 @@ def main(folder, *bounds):
     for bound in bounds:
         key, lowest, highest = bound.split(":")
         value = metrics[key]
-        inside = value is not None and (not lowest or value >= float(lowest)) and (not highest or value <= float(highest))
+        inside = (
+            value is not None and (not lowest or value >= float(lowest)) and (not highest or value <= float(highest))
+        )
         violated += not inside
         print(f"{Path(folder).name}: {key} = {value} {'within' if inside else 'OUTSIDE'} [{lowest}, {highest}]")
     return violated

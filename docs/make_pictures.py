@@ -13,7 +13,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from taichi_edges.edges.edge_set import read_edges
+from taichi_edges.edge_set import read_edges
 from taichi_edges.exporters.overlays import background, draw_edges
 from taichi_edges.exporters.palette import label_colours
 from taichi_edges.views import read_views

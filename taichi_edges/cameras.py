@@ -37,7 +37,7 @@ class Similarity:
 
     @staticmethod
     def of_box(box):
-        """The similarity that brings `box`, (2, 3) corners in input units, into the unit cube, its longest side to 1."""
+        """The similarity that brings `box`, (2, 3) corners input units, into the unit cube, its longest side to 1."""
         box = np.asarray(box, dtype=np.float64)
         scale = 1.0 / float((box[1] - box[0]).max())
         return Similarity(scale, tuple(float(x) for x in -box[0] * scale))

@@ -96,7 +96,7 @@ def _print_table(title, headings, rows):
 
 def show(run):
     """An Open3D window of the oriented points and the edges."""
-    from taichi_edges.edges.edge_set import read_edges
+    from taichi_edges.edge_set import read_edges
     from taichi_edges.exporters.point_cloud import read_oriented_points
     from taichi_edges.exporters.viewer import show as show_window
 

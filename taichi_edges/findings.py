@@ -15,7 +15,8 @@ def left_out(*amounts):
 def describe_prepare(facts):
     """'12 views, 128 x 128 px, lines 2.4 px wide'."""
     part = f" of the synthetic part '{facts['part']}'" if "part" in facts else ""
-    return f"{amount(facts['views'], 'view')}{part}, {facts['width_px']} x {facts['height_px']} px, lines {facts['line_width_px']:.1f} px wide"
+    size = f"{facts['width_px']} x {facts['height_px']} px, lines {facts['line_width_px']:.1f} px wide"
+    return f"{amount(facts['views'], 'view')}{part}, {size}"
 
 
 def describe_train(facts):

@@ -28,7 +28,7 @@ from taichi_edges.progress import Progress
 
 STAGE_KEYS = {"seconds", "peak_memory_mib", "fingerprint", "inputs", "outputs", "facts"}
 DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR)
-PACKAGES = ("taichi", "numpy", "scipy", "opencv-python-headless", "open3d", "open3d-cpu", "pycolmap")
+PACKAGES = ("taichi", "numpy", "scipy", "opencv-python-headless", "open3d", "open3d-cpu")
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,11 @@ STAGES = {
     ),
     "fit": Stage(stages.fit, ("fit", "name", "seed"), ("clusters.npz", "views.npz"), ("edges.json",)),
     "evaluate": Stage(
-        stages.evaluate, ("evaluation",), ("edges.json", "views.npz"), ("metrics.json", "metrics.csv"), stages.truth_files
+        stages.evaluate,
+        ("evaluation",),
+        ("edges.json", "views.npz"),
+        ("metrics.json", "metrics.csv"),
+        stages.truth_files,
     ),
     "export": Stage(stages.export, (), ("edges.json", "views.npz"), ("overlays.png",), stages.picture_files),
 }
@@ -158,7 +162,8 @@ def _open_record(run):
         "scene": scene,
         "threads": run.threads,
         "arch": run.arch,
-        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
+        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        "python": platform.python_version(),
         "versions": _versions(),
         "ran": [],
         "stages": {name: stage for name, stage in known if isinstance(stage, dict) and set(stage) >= STAGE_KEYS},

@@ -67,7 +67,9 @@ class PlainProgress(Progress):
             return
         task.reported = now
         left = task.remaining(done)
-        self.say(f"  {task.title}: {100 * done / task.total:.0f} %, about {left:.0f} s left{f', {note}' if note else ''}")
+        self.say(
+            f"  {task.title}: {100 * done / task.total:.0f} %, about {left:.0f} s left{f', {note}' if note else ''}"
+        )
 
 
 class TerminalProgress(PlainProgress):
@@ -76,7 +78,8 @@ class TerminalProgress(PlainProgress):
     def __init__(self):
         super().__init__()
         from rich.console import Console
-        from rich.progress import BarColumn, Progress as Bars, TaskProgressColumn, TextColumn, TimeRemainingColumn
+        from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+        from rich.progress import Progress as Bars
 
         self.console = Console(stderr=True, highlight=False, emoji=False)
         columns = [TextColumn("  {task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()]

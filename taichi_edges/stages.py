@@ -17,9 +17,9 @@ import numpy as np
 
 from taichi_edges.artefacts import replacing, write_json, write_text
 from taichi_edges.cameras import transform
+from taichi_edges.edge_set import read_edges, write_edges
 from taichi_edges.edges.branches import separate_branches
 from taichi_edges.edges.clustering import grow_clusters
-from taichi_edges.edges.edge_set import read_edges, write_edges
 from taichi_edges.edges.filtering import filter_points
 from taichi_edges.edges.fitting import fit_clusters
 from taichi_edges.edges.segmentation import split_clusters
@@ -93,21 +93,25 @@ def _prepare_synthetic(run):
     write_edges(run.path("truth.json"), part.edges, {"part": part.name})
     write_views(run.path("views.npz"), views)
     size = {"width_px": views.width, "height_px": views.height}
-    return {"views": len(views), **size, **facts, "part": part.name, "files": ["truth.json", *files, *_copy_points(run)]}
+    return {
+        "views": len(views),
+        **size,
+        **facts,
+        "part": part.name,
+        "files": ["truth.json", *files, *_copy_points(run)],
+    }
 
 
 def train(run):
     """`views.npz` -> `gaussians.ply` (input frame) and `train_log.csv`."""
     from taichi_edges.exporters.splats import write_gaussians
-    from taichi_edges.splatting.gaussians import start_gaussians
     from taichi_edges.splatting.training import Training, start_taichi
 
     config, views = run.config.train, read_views(run.path("views.npz"))
     generator = np.random.default_rng(run.config.seed)
     with contextlib.redirect_stdout(io.StringIO()):  # ti.init announces itself with a bare print
         start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)
-    points = _start_points(run, views, generator)
-    start = start_gaussians(points, generator, config.initial_scale, config.initial_opacity)
+    start = _start(run, views, generator)
     training = Training(views, config, generator, run.threads, run.arch)
     gaussians, records = training.run(start, run.progress)
     rows = [("epoch", "seconds", "loss", "gaussians")]
@@ -125,18 +129,27 @@ def train(run):
     return {"gaussians": len(gaussians), "view_steps": training.step, "final_loss": loss}
 
 
-def _start_points(run, views, generator):
-    """(n, 3) unit-cube points to start from: random ones, or those of `seeds.ply`."""
+def _start(run, views, generator):
+    """The Gaussians that training starts from, as `train.seeds` says."""
     from taichi_edges.exporters.ply import read_vertices, stack_fields
-    from taichi_edges.splatting.seeding import given_points, random_points
+    from taichi_edges.splatting.gaussians import start_gaussians
+    from taichi_edges.splatting.seeding import given_points, random_points, voted_gaussians
 
     config = run.config.train
-    if config.seeds == "random":
-        return random_points(config.gaussians, views.box, generator)
-    if not run.path("seeds.ply").exists():
-        raise UserError("train.seeds: points need a file to come from; name it in source.points, or set seeds to random")
-    given = stack_fields(read_vertices(run.path("seeds.ply"), ("x", "y", "z")), ("x", "y", "z"))
-    return given_points(views.similarity.to_unit(given.astype(np.float64)), config.gaussians, generator)
+    if config.seeds == "votes":
+        voted = voted_gaussians(views, config.edge_threshold, config.gaussians, config.initial_opacity, generator)
+        if voted is not None:
+            return voted
+        run.progress.warn("too few places where the views agree on an edge; the training starts from random points")
+    if config.seeds == "points":
+        if not run.path("seeds.ply").exists():
+            problem = "points need a file to come from"
+            raise UserError(f"train.seeds: {problem}; name it in source.points, or set train.seeds to random")
+        given = stack_fields(read_vertices(run.path("seeds.ply"), ("x", "y", "z")), ("x", "y", "z"))
+        points = given_points(views.similarity.to_unit(given.astype(np.float64)), config.gaussians, generator)
+    else:
+        points = random_points(config.gaussians, views.box, generator)
+    return start_gaussians(points, generator, config.initial_scale, config.initial_opacity)
 
 
 def seed_files(run):
@@ -273,9 +286,13 @@ def source_files(run):
 
 def truth_files(run):
     """Every file the ground truth consists of."""
+    from taichi_edges.evaluation.ground_truth import refuse_unknown
+
     path = truth_path(run)
     if path is None:
         return []
+    if run.config.evaluation.truth:  # that of a synthetic scene may still have to be written
+        refuse_unknown(path)
     return sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [Path(path)]
 
 

@@ -92,4 +92,3 @@ def _owners(points, rows, columns, height, width, radius):
     targets = (rows[:, None] + down[disc] + margin, columns[:, None] + right[disc] + margin)
     owners[targets] = points[:, None]  # NumPy assigns in order, so the strongest, which come last, stay
     return owners[margin : margin + height, margin : margin + width]
-

@@ -5,9 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from taichi_edges.artefacts import replacing
-from taichi_edges.cameras import Similarity, inside_image, project
-
-EDGE_THRESHOLD = 0.5  # of the map's full scale; from here on a pixel counts as an edge pixel
+from taichi_edges.cameras import Similarity, project
 
 
 @dataclass(frozen=True)
@@ -55,23 +53,6 @@ class Views:
     def project(self, points, view):
         """Pixels (n, 2), NaN behind the camera, and depths (n,) of (n, 3) unit-cube points in one view."""
         return project(points, self.intrinsics[view], self.world_to_camera[view])
-
-    def edge_support(self, points, threshold=EDGE_THRESHOLD):
-        """How often points fall on edge pixels.
-
-        points: (n, 3) unit cube. threshold: of the map's full scale.
-        Returns (n,) number of views in which the point's pixel is an edge pixel, and (n,) number of views that have
-        the point in front of the camera (z > 0) and inside the image. Occlusion is not known here.
-        """
-        on_edge = np.zeros(len(points), np.int32)
-        seen = np.zeros(len(points), np.int32)
-        for view in range(len(self)):
-            pixels, _ = self.project(points, view)
-            inside = inside_image(pixels, self.width, self.height)
-            columns, rows = np.rint(pixels[inside]).astype(np.int64).T
-            seen += inside
-            on_edge[inside] += self.edge_maps[view, rows, columns] >= threshold * 255
-        return on_edge, seen
 
 
 def write_views(path, views):

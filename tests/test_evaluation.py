@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from taichi_edges.edges.bezier import bernstein, evaluate_bezier
-from taichi_edges.edges.edge_set import EdgeSet, write_edges
+from taichi_edges.bezier import bernstein, evaluate_bezier
+from taichi_edges.edge_set import EdgeSet, write_edges
 from taichi_edges.errors import UserError
 from taichi_edges.evaluation.ground_truth import GroundTruth, edges_of_list, read_ground_truth, true_parameters
 from taichi_edges.evaluation.metrics import (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from taichi_edges.cameras import Similarity
-from taichi_edges.edges.edge_set import EdgeSet
+from taichi_edges.edge_set import EdgeSet
 from taichi_edges.errors import UserError
 from taichi_edges.exporters import EXPORTERS
 from taichi_edges.exporters.line_sets import (

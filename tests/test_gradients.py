@@ -6,8 +6,21 @@ import numpy as np
 import pytest
 import taichi as ti
 from reference_splatting import (
-    INSIDE, NO_EDGES, OBLIQUE, OUTSIDE, PARAMETERS, alphas, gradient, image_loss, orient_loss, project,
-    random_gaussians, random_scene, selected, shape_loss, slope,
+    INSIDE,
+    NO_EDGES,
+    OBLIQUE,
+    OUTSIDE,
+    PARAMETERS,
+    alphas,
+    gradient,
+    image_loss,
+    orient_loss,
+    project,
+    random_gaussians,
+    random_scene,
+    selected,
+    shape_loss,
+    slope,
 )
 
 from taichi_edges.splatting.gaussians import Gaussians

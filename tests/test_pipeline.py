@@ -14,24 +14,42 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from taichi_edges.artefacts import remove_unfinished, replacing
-from taichi_edges.edges.edge_set import read_edges
+from taichi_edges.cameras import Similarity, invert_pose
+from taichi_edges.edge_set import EdgeSet, read_edges, write_edges
 from taichi_edges.errors import UserError
+from taichi_edges.exporters.point_cloud import read_oriented_points
+from taichi_edges.exporters.splats import read_gaussians
 from taichi_edges.findings import FINDINGS
 from taichi_edges.pipeline import STAGES, Run, run_stages
 from taichi_edges.progress import PlainProgress, TerminalProgress
 from taichi_edges.readers.points import read_points
-from taichi_edges.scene import load_scene
+from taichi_edges.scene import check_scene, load_scene, parse_yaml
 from taichi_edges.splatting.seeding import given_points
-from taichi_edges.views import read_views
+from taichi_edges.stages import evaluate
+from taichi_edges.views import Views, read_views, write_views
 
 ROOT = Path(__file__).parent.parent
 ARTEFACTS = (
-    "views.npz", "gaussians.ply", "train_log.csv", "points.ply", "clusters.npz", "edges.json", "metrics.json", "metrics.csv",
-    "edges.ply", "edges.obj", "overlays.png", "run.json", "scene.yaml", "truth.json",
+    "views.npz",
+    "gaussians.ply",
+    "train_log.csv",
+    "points.ply",
+    "clusters.npz",
+    "edges.json",
+    "metrics.json",
+    "metrics.csv",
+    "edges.ply",
+    "edges.obj",
+    "overlays.png",
+    "run.json",
+    "scene.yaml",
+    "truth.json",
 )
 SCENE = """
 source: {reader: synthetic, part: block, views: 12, size: 112}
@@ -173,6 +191,57 @@ def states(ran, skipped):
     return {**dict.fromkeys(skipped, "up to date"), **dict.fromkeys(ran, "ran")}
 
 
+# -------------------------------------------------------------------------------------------------- units and frames
+
+
+def test_metrics_do_not_depend_on_the_units_of_the_input(tmp_path):
+    """One "mm" is 0.001 of the unit cube: edges 4 input units beside the truth in a box of 2000 are 2 mm off."""
+    box = [[-1000.0, -1000, -1000], [1000, 1000, 1000]]
+    views = Views(
+        ("a",), np.zeros((1, 8, 8), np.uint8), np.eye(3)[None], np.eye(4)[None, :3], ("",), Similarity.of_box(box)
+    )
+    write_views(tmp_path / "views.npz", views)
+    ends = np.array([[[-800.0, 0, 0], [800, 0, 0]]])
+    write_edges(tmp_path / "truth_in_input_units.json", EdgeSet.of(ends), {})
+    write_edges(tmp_path / "edges.json", EdgeSet.of(ends + [0, 4, 0]), {})
+    scene = {"source": {"reader": "emap", "path": "x"}, "box": box}
+    scene["evaluation"] = {"truth": str(tmp_path / "truth_in_input_units.json")}
+    metrics = evaluate(Run(check_scene(scene, "the test"), tmp_path))
+    assert metrics["accuracy_mm"] == pytest.approx(2.0, abs=0.05)
+    assert metrics["true_length_units"] == pytest.approx(0.8)
+
+
+def test_everything_exported_is_in_the_frame_of_the_input(finished, tmp_path):
+    """The views of the finished run again, as a folder whose units are 2000 to the unit cube, centred at zero."""
+    scene, runs, _ = finished
+    views = read_views(runs / "tiny/views.npz")
+    (tmp_path / "data/maps").mkdir(parents=True)
+    frames = []
+    for view, name in enumerate(views.names):
+        cv2.imwrite(str(tmp_path / f"data/maps/{name}.png"), views.edge_maps[view])
+        pose = np.eye(4)
+        pose[:3] = invert_pose(views.world_to_camera[view])
+        pose[:3, 3] = 2000 * pose[:3, 3] - 1000
+        frames.append(
+            {"rgb_path": f"{name}.png", "camtoworld": pose.tolist(), "intrinsics": views.intrinsics[view].tolist()}
+        )
+    (tmp_path / "data/meta_data.json").write_text(json.dumps({"frames": frames}))
+    content = parse_yaml(scene.read_text(), scene)
+    content["source"] = {"reader": "emap", "path": str(tmp_path / "data"), "edges": "maps", "thin": False}
+    content["box"] = [[-1000, -1000, -1000], [1000, 1000, 1000]]
+    content["train"]["learning_rates"]["scales"] = 0.0  # so that the Gaussians keep the scale they start with
+    (tmp_path / "large.yaml").write_text(json.dumps(content))
+    succeed(command(tmp_path / "large.yaml", tmp_path / "runs", "--until", "fit"))
+    truth, _ = read_edges(runs / "tiny/truth.json")
+    on_edges = cKDTree(2000 * truth.sample(0.002)[0] - 1000)
+    _, log_scales, _, _ = read_gaussians(tmp_path / "runs/large/gaussians.ply")
+    np.testing.assert_allclose(np.exp(log_scales), 2000 * 0.004, rtol=1e-5)
+    points, _ = read_oriented_points(tmp_path / "runs/large/points.ply")
+    found, _ = read_edges(tmp_path / "runs/large/edges.json")
+    assert np.median(on_edges.query(points)[0]) < 2000 * 0.02  # the tiny run is rough: 0.01 in the unit cube
+    assert np.median(on_edges.query(found.sample(10)[0])[0]) < 2000 * 0.02
+
+
 # ----------------------------------------------------------------------------------------------------- a whole run
 
 
@@ -219,8 +288,12 @@ def test_output_is_a_summary_and_the_progress_goes_to_standard_error(finished):
     assert done.stdout.startswith("tiny: metrics\n") and "F-score at 5 mm" in done.stdout
     assert "results: " in done.stdout and "edges.json, edges.ply, edges.obj, overlays.png" in done.stdout
     lines = done.stderr.splitlines()
-    assert lines[0] == "prepare ..." and lines[-1].startswith("export: edges.ply, edges.obj, overlays.png and 4 pictures")
-    assert any(re.fullmatch(r"train: \d+ Gaussians after 480 view steps, final loss 0\.\d{4} \(.* s\)", line) for line in lines)
+    assert lines[0] == "prepare ..." and lines[-1].startswith(
+        "export: edges.ply, edges.obj, overlays.png and 4 pictures"
+    )
+    assert any(
+        re.fullmatch(r"train: \d+ Gaussians after 480 view steps, final loss 0\.\d{4} \(.* s\)", line) for line in lines
+    )
 
 
 def test_every_stage_can_say_what_it_found():
@@ -310,7 +383,9 @@ def test_a_hand_edited_artefact_is_noticed_and_made_again(copied):
     assert (folder / "edges.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"stages": []}', '{"stages": {"train": 3, "fit": {"seconds": 1}}}'])
+@pytest.mark.parametrize(
+    "content", ["", "{", "[]", '{"stages": []}', '{"stages": {"train": 3, "fit": {"seconds": 1}}}']
+)
 def test_a_damaged_record_is_no_obstacle(copied, content):
     _, _, folder = copied
     (folder / "run.json").write_text(content)
@@ -376,6 +451,11 @@ def test_a_mistyped_truth_is_refused_before_the_training(copied, tmp_path):
     assert "evaluation.truth: " in message and "does not exist" in message
 
 
+def test_a_truth_of_no_known_kind_is_refused_before_the_training(copied, tmp_path):
+    with pytest.raises(UserError, match="no \\*_features_\\*.yml in it"):
+        rerun(copied, [f"evaluation.truth={tmp_path}", "train.epochs=41"])
+
+
 def test_filters_that_leave_nothing_are_refused_with_counts(copied):
     message = refused(copied, settings=["filter.min_opacity=1"])
     assert "Gaussians passed the filters (" in message and "low opacity" in message and "filter.min_opacity" in message
@@ -391,7 +471,9 @@ def test_seeds_that_the_source_does_not_have_are_refused(copied):
 
 def write_cloud(path, points):
     """An ASCII PLY as any other program writes it."""
-    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\nproperty float x\nproperty float y\nproperty float z\n"
+    header = (
+        f"ply\nformat ascii 1.0\nelement vertex {len(points)}\nproperty float x\nproperty float y\nproperty float z\n"
+    )
     path.write_text(header + "end_header\n" + "".join(f"{x} {y} {z}\n" for x, y, z in points))
     return path
 
@@ -425,7 +507,10 @@ def test_given_points_are_refused_when_there_is_none_to_use(copied, tmp_path):
         (["scenes/demo.yaml", "--threads", "two"], "argument --threads: invalid int value: 'two'"),
         (["scenes/demo.yaml", "--stage", "fti"], "argument --stage: invalid choice"),
         (["scenes/abc_00000006.yaml", "--data", "~nobody-of-this-name"], "--data: ~nobody-of-this-name: '~' and what"),
-        (["scenes/demo.yaml", "--set", "fit.delat=1"], "--set fit.delat=1: fit.delat: unknown key; did you mean 'delta'?"),
+        (
+            ["scenes/demo.yaml", "--set", "fit.delat=1"],
+            "--set fit.delat=1: fit.delat: unknown key; did you mean 'delta'?",
+        ),
         (["scenes/demo.yaml", "--show", "--until", "train"], "--show needs the edges"),
         (["scenes/demo.yaml", "--stage", "fit", "--until", "train"], "--stage fit comes after --until train"),
     ],
@@ -449,7 +534,9 @@ def test_a_device_that_is_not_there_is_refused(copied):
     assert "--arch cuda: this machine offers Taichi no cuda device; use --arch cpu" in message
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux tells by a variable that there is no display")
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="only Linux tells by a variable that there is no display"
+)
 def test_show_without_a_display_says_what_to_open_instead(copied):
     scene, runs, _ = copied
     message = refuse(command(scene, runs, "--show"), DISPLAY="", WAYLAND_DISPLAY="")
@@ -460,7 +547,8 @@ def test_a_closed_pipe_is_no_error(copied):
     scene, runs, _ = copied
     code = (
         "import subprocess, sys\n"
-        f"run = subprocess.Popen([sys.executable, {str(ROOT / 'run.py')!r}, *{command(scene, runs)!r}], stdout=subprocess.PIPE, "
+        f"run = subprocess.Popen([sys.executable, {str(ROOT / 'run.py')!r}, *{command(scene, runs)!r}], "
+        "stdout=subprocess.PIPE, "
         "stderr=subprocess.PIPE)\nrun.stdout.close()\nsys.stderr.write(run.stderr.read().decode())\nsys.exit(run.wait())"
     )
     done = start([], code=code)
@@ -504,7 +592,10 @@ def test_a_kill_leaves_a_finished_run_of_other_settings_noticed(copied):
     kill_in("evaluate", command(scene, runs, "--set", "fit.min_length=0.6"))
     rerun(copied)  # the first settings again
     assert (folder / "edges.json").read_bytes() == before
-    assert json.loads((folder / "run.json").read_text())["stages"]["fit"]["inputs"]["settings"]["fit"]["min_length"] == 0.01
+    assert (
+        json.loads((folder / "run.json").read_text())["stages"]["fit"]["inputs"]["settings"]["fit"]["min_length"]
+        == 0.01
+    )
 
 
 def test_one_seed_gives_the_same_edges_and_another_seed_others(finished, tmp_path):

@@ -301,7 +301,7 @@ def test_emap_sizes_that_are_no_sizes_are_refused(emap, size):
     assert "width and height must both be whole numbers of pixels" in emap.refusal()
 
 
-@pytest.mark.parametrize("values", [[1], "x", (np.eye(4) * np.nan).tolist()])
+@pytest.mark.parametrize("values", [[1], "x", (np.eye(4) * np.nan).tolist(), np.zeros((4, 4)).tolist()])
 def test_emap_worldtogt_that_is_no_matrix_is_refused(emap, values):
     emap.content["worldtogt"] = values
     assert "worldtogt" in emap.refusal()
@@ -411,7 +411,9 @@ def test_a_field_of_view_that_is_no_angle_is_refused(nerf, angle):
 def test_maps_of_another_size_than_the_calibration_are_warned_about(folder):
     folder.change_maps(lambda edge_map: cv2.resize(edge_map, (256, 256)))
     folder.read()
-    assert "4 of 4 views: the principal point is far from the centre of the 256 x 256 px image" in folder.warnings.texts[0]
+    assert (
+        "4 of 4 views: the principal point is far from the centre of the 256 x 256 px image" in folder.warnings.texts[0]
+    )
 
 
 # -------------------------------------------------------------------------------------------------- wrong edge maps
@@ -429,7 +431,9 @@ def truncate(path):
 def test_a_damaged_edge_map_is_named(folder, spoil):
     spoil(folder.edge_map(1))
     message = folder.refusal()
-    assert f"1 of 4 views (v1): the edge map is truncated or not an 8- or 16-bit image ({folder.edge_map(1)})" in message
+    assert (
+        f"1 of 4 views (v1): the edge map is truncated or not an 8- or 16-bit image ({folder.edge_map(1)})" in message
+    )
 
 
 @pytest.mark.parametrize("share", [0.3, 0.9, 0.99])
@@ -479,6 +483,11 @@ def test_one_edge_map_without_an_edge_is_warned_about(folder):
     assert folder.warnings.texts == ["1 of 4 edge maps have no edge pixel and teach nothing: v1"]
 
 
+def test_one_white_edge_map_is_refused_by_name(folder):
+    folder.change_maps(lambda edge_map: 0 * edge_map + 255, [1])
+    assert "1 of 4 views (v1): most of the edge map is edge pixels" in folder.refusal()
+
+
 def test_black_on_white_is_refused(folder):
     folder.change_maps(lambda edge_map: 255 - edge_map)
     assert "edges must be white on black: invert the maps" in folder.refusal()
@@ -489,7 +498,9 @@ def test_black_on_white_is_refused(folder):
 
 def test_colour_images_are_found(folder):
     shutil.copytree(folder.path / EDGES[folder.kind], folder.path / "color")
-    assert folder.read(images="color").image_paths == tuple(str(folder.path / "color" / f"v{i}.png") for i in range(VIEWS))
+    assert folder.read(images="color").image_paths == tuple(
+        str(folder.path / "color" / f"v{i}.png") for i in range(VIEWS)
+    )
     assert folder.warnings.texts == []
 
 

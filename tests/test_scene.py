@@ -123,7 +123,15 @@ def test_a_key_with_a_line_break_is_refused_in_one_line(scene):
 
 @pytest.mark.parametrize(
     ("written", "read"),
-    [("1e-3", 0.001), ("1E-3", 0.001), ("1.e3", 1000.0), ("1", 1.0), (".5", 0.5), ("+2.5e+1", 25.0), ("1_000.5", 1000.5)],
+    [
+        ("1e-3", 0.001),
+        ("1E-3", 0.001),
+        ("1.e3", 1000.0),
+        ("1", 1.0),
+        (".5", 0.5),
+        ("+2.5e+1", 25.0),
+        ("1_000.5", 1000.5),
+    ],
 )
 def test_numbers_are_read_as_numbers(scene, written, read):
     value = load_scene(scene(f"fit: {{delta: {written}}}")).fit.delta
@@ -164,8 +172,8 @@ def test_whole_numbers_are_read(scene, written, read):
         ("box: 3", "box: must be a list"),
         ("box: [[0, 0, 0], [1, 1]]", "box.1: must have 3 entries, not 2"),
         ("box: [[0, 0, 0], [1, 1, 0]]", "box: the second corner must be greater than the first"),
-        ("preset: papre", "preset: must be 'paper', not 'papre'"),
-        ("preset: [paper]", "preset: must be 'paper'"),
+        ("preset: papre", "preset: must be 'paper' or 'fast', not 'papre'"),
+        ("preset: [paper]", "preset: must be 'paper' or 'fast'"),
         ("3: 4", "3: a key must be a text"),
     ],
 )
@@ -197,6 +205,7 @@ def test_a_file_name_that_cannot_name_a_folder_is_refused(scene):
         ("fit: *nowhere\n", "line 2, column 6", "not valid YAML"),
         ("fit: !!python/name:os.system {}\n", "line 2, column 6", "not valid YAML"),
         ("---\nseed: 1\n", "line 2, column 1", "not valid YAML"),
+        ("fit: " + 3000 * "[", "not valid YAML", "nested too deeply"),
     ],
 )
 def test_broken_yaml_is_named_with_line_and_column(scene, text, place, says):

@@ -4,8 +4,20 @@ import numpy as np
 import pytest
 import taichi as ti
 from reference_splatting import (
-    INSIDE, MOSTLY_EDGES, NO_EDGES, OBLIQUE, OUTSIDE, PARAMETERS, Scene, alphas, image_loss, project, random_gaussians,
-    random_scene, render, selected,
+    INSIDE,
+    MOSTLY_EDGES,
+    NO_EDGES,
+    OBLIQUE,
+    OUTSIDE,
+    PARAMETERS,
+    Scene,
+    alphas,
+    image_loss,
+    project,
+    random_gaussians,
+    random_scene,
+    render,
+    selected,
 )
 
 from taichi_edges.splatting.gaussians import Gaussians, rotation_matrices, start_gaussians
@@ -224,7 +236,7 @@ def test_threshold_parts_edges_from_background_at_the_same_level_as_the_views(op
     scene = Scene(maps, np.eye(3)[None], np.eye(4)[None, :3])
     splatter = open_splatter(scene, edge_threshold=0.4)
     splatter.select_pixels(0, 0)
-    edges = np.flatnonzero(maps.ravel() >= 0.4 * 255)  # as Views.edge_support reads it
+    edges = np.flatnonzero(maps.ravel() >= 0.4 * 255)
     assert splatter.images.edge_counts[0] == len(edges)
     np.testing.assert_array_equal(splatter.selection.pixels.to_numpy()[: len(edges)], edges)
 

@@ -25,7 +25,9 @@ def scene(*segments):
             normal = np.array([-along[1], along[0]]) / np.linalg.norm(along)
             inside = ((pixels > 0) & (pixels < SIZE - 1)).all(axis=1)
             points = pixels[inside]
-            drawn = np.maximum(drawn, draw_ridges(points, np.tile(normal, (len(points), 1)), np.ones(len(points)), SIZE, SIZE))
+            drawn = np.maximum(
+                drawn, draw_ridges(points, np.tile(normal, (len(points), 1)), np.ones(len(points)), SIZE, SIZE)
+            )
         maps.append(drawn)
     return Views(views.names, np.stack(maps), intrinsics, poses, ("",) * VIEWS)
 

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.spatial import cKDTree
 
-from taichi_edges.edges.bezier import evaluate_bezier
-from taichi_edges.edges.edge_set import EdgeSet
+from taichi_edges.bezier import evaluate_bezier
+from taichi_edges.edge_set import EdgeSet
 from taichi_edges.edges.ordering import order_points
 
 ROBUST_ROUNDS = 10

@@ -15,7 +15,7 @@ SPAN = 0.6  # of the waist that a strip reaches through at least
 
 @dataclass(frozen=True)
 class Ordering:
-    """arc: (n,) arc length of each point along the edge. length: of the whole edge. closed: does it end at its start?"""
+    """arc: (n,) arc length of each point. length: of the whole edge. closed: does it end where it starts?"""
 
     arc: np.ndarray
     length: float

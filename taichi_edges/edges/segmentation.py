@@ -103,7 +103,7 @@ def stretch_cost(stretch, curved, noise):
 
 
 def local_noise(chain):
-    """Scatter of ordered (n, 3) points about their own edge, per axis across it: median over windows of NOISE_WINDOW."""
+    """Scatter of ordered (n, 3) points per axis across their edge: median over windows of NOISE_WINDOW points."""
     window = min(NOISE_WINDOW, len(chain))
     design = np.polynomial.legendre.legvander(np.linspace(-1, 1, window), 2)
     onto = design @ np.linalg.pinv(design)

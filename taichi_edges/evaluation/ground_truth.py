@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from taichi_edges.cameras import Similarity
-from taichi_edges.edges.edge_set import EdgeSet, read_edges
+from taichi_edges.edge_set import EdgeSet, read_edges
 from taichi_edges.errors import UserError, did_you_mean, name_some
 
 ABC_SPACING = 0.005  # raw CAD units (!), EMAP get_gt_points: the spacing in the unit cube differs from model to model
@@ -59,13 +59,20 @@ def read_ground_truth(path, to_unit=as_it_is):
     to_unit: affine function (n, 3) -> (n, 3) from the scene's truth frame to its unit cube, for `.ply` and `.json`.
     """
     path = Path(path)
+    refuse_unknown(path)
+    return read_abc(path) if path.is_dir() else FILE_READERS[path.suffix.lower()](path, to_unit)
+
+
+def refuse_unknown(path):
+    """UserError for what cannot be a ground truth, by names alone: quick enough to ask before the training."""
     if path.is_dir():
-        return read_abc(path)
+        if only_file(path, "*_features_*.yml") is None:
+            raise UserError(f"{path}: no *_features_*.yml in it; give an ABC folder, a sampled .ply or an edge .json")
+        return
     if not path.exists():
         raise UserError(f"{path}: no such ground truth; give an ABC folder, a sampled .ply or an edge .json")
     if path.suffix.lower() not in FILE_READERS:
         raise UserError(f"{path}: not a ground truth; give an ABC folder, a sampled .ply or an edge .json")
-    return FILE_READERS[path.suffix.lower()](path, to_unit)
 
 
 def polyline_length(polyline):
@@ -79,8 +86,6 @@ def polyline_length(polyline):
 def read_abc(folder):
     """The sharp curves of an ABC folder, sampled as EMAP samples them."""
     features = only_file(folder, "*_features_*.yml")
-    if features is None:
-        raise UserError(f"{folder}: no *_features_*.yml in it; give an ABC folder, a sampled .ply or an edge .json")
     sharp = read_sharp_curves(features)
     frame = read_frame(folder / "stats.json", scene=features.name.split("_")[0])
     mesh = only_file(folder, "*_trimesh_*.obj")

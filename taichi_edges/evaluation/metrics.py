@@ -11,7 +11,7 @@ One "mm" is 0.001 of the normalised unit. Edges and truth must be in the same fr
 import numpy as np
 from scipy.spatial import cKDTree
 
-from taichi_edges.edges.bezier import evaluate_bezier
+from taichi_edges.bezier import evaluate_bezier
 from taichi_edges.errors import UserError
 
 SAMPLE_SPACING = 0.005  # normalised units, EMAP sample_resolution

@@ -208,7 +208,9 @@ def _read_edge_maps(frames, progress):
         problem = f"{100 * share:.0f} % of all pixels are edge pixels; edges must be white on black: invert the maps"
         raise UserError(f"{paths[0].parent}: {problem}, or check source.edges")
     white = (maps >= 128).mean(axis=(1, 2)) > MOSTLY_EDGES
-    _refuse(frames, white, f"most of the edge map is edge pixels, white; edges are thin lines: write it again, {LEAVE_OUT}")
+    _refuse(
+        frames, white, f"most of the edge map is edge pixels, white; edges are thin lines: write it again, {LEAVE_OUT}"
+    )
     if empty.any():
         names = [name for name, is_empty in zip(frames.names, empty, strict=True) if is_empty]
         progress.warn(f"{len(names)} of {len(maps)} edge maps have no edge pixel and teach nothing: {name_some(names)}")

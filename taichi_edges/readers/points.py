@@ -20,5 +20,7 @@ def read_points(path, box):
     low, high = np.asarray(box, dtype=np.float64)
     inside = finite[((finite >= low) & (finite <= high)).all(axis=1)]
     if len(inside) == 0:
-        raise UserError(f"source.points: none of the {len(points)} points of {path} lies in the box; correct box or the file")
+        raise UserError(
+            f"source.points: none of the {len(points)} points of {path} lies in the box; correct box or the file"
+        )
     return inside

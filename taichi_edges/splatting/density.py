@@ -1,4 +1,4 @@
-"""Density control: which Gaussians go, which are doubled. Optimiser moments are carried along (NumPy, between steps)."""
+"""Density control: which Gaussians go, which are doubled. Optimiser moments go along (NumPy, between steps)."""
 
 from dataclasses import dataclass
 

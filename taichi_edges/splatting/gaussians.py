@@ -1,4 +1,4 @@
-"""Edge Gaussians: as NumPy arrays between the stages, as Taichi fields with gradients and Adam moments while training."""
+"""Edge Gaussians: NumPy arrays between the stages, Taichi fields with gradients and Adam moments while training."""
 
 from dataclasses import dataclass
 
@@ -37,7 +37,7 @@ class Gaussians:
         return np.exp(self.log_scales)
 
     def directions(self):
-        """(n, 3) unit vectors along the axis of the largest scale (paper 3.2: the principal direction), sign arbitrary."""
+        """(n, 3) unit vectors along the axis of the largest scale (paper 3.2: principal direction), sign arbitrary."""
         axes = rotation_matrices(self.quaternions)
         return np.take_along_axis(axes, self.log_scales.argmax(axis=1)[:, None, None], axis=2)[:, :, 0]
 
@@ -72,6 +72,25 @@ def start_gaussians(points, generator, scale=SCALE_INIT, opacity=OPACITY_INIT):
     return Gaussians(
         means=np.asarray(points, dtype=np.float32),
         log_scales=np.full((count, 3), np.log(scale), dtype=np.float32),
+        quaternions=quaternions.astype(np.float32),
+        opacity_logits=np.full(count, logit(opacity), dtype=np.float32),
+    )
+
+
+def orient_gaussians(points, directions, along, across, opacity):
+    """Gaussians at (n, 3) points with their first axis along (n, 3) unit `directions`.
+
+    along, across: standard deviations along that axis and across it, unit-cube units. opacity: 0..1.
+    """
+    count = len(points)
+    # The shortest rotation from the x axis to the direction; for the opposite direction, half a turn about z.
+    x_axis = np.array([1.0, 0.0, 0.0])
+    quaternions = np.concatenate([1 + directions @ x_axis[:, None], np.cross(x_axis, directions)], axis=1)
+    quaternions[quaternions[:, 0] < 1e-6] = [0.0, 0.0, 0.0, 1.0]
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return Gaussians(
+        means=np.asarray(points, dtype=np.float32),
+        log_scales=np.log(np.tile([along, across, across], (count, 1))).astype(np.float32),
         quaternions=quaternions.astype(np.float32),
         opacity_logits=np.full(count, logit(opacity), dtype=np.float32),
     )

@@ -1,4 +1,4 @@
-"""Losses of the paper, differentiated by Taichi: L_proj (eq. 3), L_orient (eq. 4), L_shape (eq. 5), summed as in eq. 6."""
+"""The paper's losses, differentiated by Taichi: L_proj (eq. 3), L_orient (eq. 4), L_shape (eq. 5), summed (eq. 6)."""
 
 import numpy as np
 import taichi as ti
@@ -29,7 +29,9 @@ class NeighborFields:
         self.capacity, self.k = capacity, k
         self.indices = ti.field(ti.i32, shape=(capacity, k))
         self.means = ti.Vector.field(3, real, shape=(capacity, k), needs_grad=True)
-        self.user_starts = ti.field(ti.i32, shape=capacity + 1)  # users of i: users[user_starts[i] : user_starts[i + 1]]
+        self.user_starts = ti.field(
+            ti.i32, shape=capacity + 1
+        )  # users of i: users[user_starts[i] : user_starts[i + 1]]
         self.users = ti.field(ti.i32, shape=capacity * k)  # flat positions into (capacity, k)
 
     def load(self, neighbors):

@@ -2,6 +2,12 @@
 
 import numpy as np
 
+from taichi_edges.splatting.gaussians import orient_gaussians
+from taichi_edges.splatting.voting import vote_seeds
+
+ALONG_PX, ACROSS_PX = 2.0, 0.7  # standard deviations of a voted Gaussian, in pixels at the scene
+LEAST_VOTED = 50  # fewer seeds than this are no start
+
 
 def random_points(count, box, generator):
     """(count, 3) points uniform in the box (2, 3): the supplement's start for textureless objects."""
@@ -14,3 +20,18 @@ def given_points(points, count, generator):
     if len(points) <= count:
         return points
     return points[np.sort(generator.choice(len(points), count, replace=False))]
+
+
+def voted_gaussians(views, edge_threshold, count, opacity, generator):
+    """At most `count` Gaussians where many views agree that an edge passes, laid along it; None if too few.
+
+    ti.init must have been called. edge_threshold: of full scale. opacity: 0..1.
+    """
+    seeds = vote_seeds(views, edge_threshold, generator)
+    if len(seeds.points) < LEAST_VOTED:
+        return None
+    chosen = np.arange(len(seeds.points))
+    if len(chosen) > count:
+        chosen = np.sort(generator.choice(len(chosen), count, replace=False))
+    along, across = ALONG_PX * seeds.pixel, ACROSS_PX * seeds.pixel
+    return orient_gaussians(seeds.points[chosen], seeds.directions[chosen], along, across, opacity)

@@ -1,4 +1,4 @@
-"""Which pixels of a view the splat is evaluated at: those the loss looks at (paper eq. 3), as slots and as a bit mask."""
+"""The pixels of a view at which the splat is evaluated: those of the loss (paper eq. 3), as slots and as a bit mask."""
 
 import numpy as np
 import taichi as ti

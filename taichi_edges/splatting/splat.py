@@ -132,8 +132,9 @@ def make_forward(target, selection, threads, schedule):
 
 
 def make_adjoint(gaussians, target, selection):
-    """Kernels spread_adjoint(slots, adjoint): T dL/dT from slots to the image, and gather_adjoint(count, mask, adjoint):
-    from the image to the splats."""
+    """Kernels spread_adjoint(slots, adjoint): T dL/dT from the slots to the image, and
+    gather_adjoint(count, mask, adjoint): from the image to the splats.
+    """
     real = selection.real
     splats, boxes, positional = target.splats, target.boxes, gaussians.positional_gradients
     pixels, transmittance = selection.pixels, selection.transmittance

@@ -16,7 +16,7 @@ from taichi_edges.splatting.splatter import GPU_ARCHS, Splatter
 
 @dataclass(frozen=True)
 class EpochRecord:
-    """One line of the training log. Seconds since the start of training; loss: mean of L_proj over the epoch's views."""
+    """One line of the training log. seconds: since the start. loss: mean of L_proj over the epoch's views."""
 
     epoch: int
     seconds: float
@@ -170,7 +170,7 @@ class Training:
         return self._limit_opacity(density.cull_opacity(population, self.config.density.min_opacity))
 
     def _limit_opacity(self, population):
-        """Opacities down to the initial one after a cull, so that the survivors must earn theirs again (3DGS's reset)."""
+        """Opacities down to the initial one after a cull, so that the survivors must earn theirs again (as in 3DGS)."""
         if not self.config.density.reset_opacity:
             return population
         gaussians = population.gaussians

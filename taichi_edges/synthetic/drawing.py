@@ -36,9 +36,7 @@ class Imperfections:
     @staticmethod
     def none():
         """Clean maps: the visible sharp edges, all of them and nothing else."""
-        return Imperfections(
-            blur_px=0.0, gap_fraction=0.0, jitter_px=0.0, speckle=0.0, noise=0.0, contours=False
-        )
+        return Imperfections(blur_px=0.0, gap_fraction=0.0, jitter_px=0.0, speckle=0.0, noise=0.0, contours=False)
 
 
 def draw_edge_map(pixels, chains, strokes, visible, image_size, imperfections, generator):

@@ -3,7 +3,16 @@
 import numpy as np
 
 from taichi_edges.synthetic.profiles import (
-    Path, Profile, circle, corner_arc, curve, join, line, polygon, rectangle, slot,
+    Path,
+    Profile,
+    circle,
+    corner_arc,
+    curve,
+    join,
+    line,
+    polygon,
+    rectangle,
+    slot,
 )
 from taichi_edges.synthetic.solids import Part, assemble, extrude, revolve
 from taichi_edges.synthetic.surfaces import cap, pierced, wall
@@ -80,10 +89,12 @@ def demo():
     foot, rib_top, hub_top = 0.14, 0.24, 0.36
     outline = demo_outline()
     hub, bore, chamfer, middle = 0.165, 0.085, 0.03, (0.29, 0.33)
-    rib = Path((
-        curve([(0.52, 0.46), (0.60, 0.62), (0.76, 0.40), (0.90, 0.50)]),
-        curve([(0.90, 0.50), (0.80, 0.28), (0.62, 0.36), (0.52, 0.46)]),
-    )).reversed()
+    rib = Path(
+        (
+            curve([(0.52, 0.46), (0.60, 0.62), (0.76, 0.40), (0.90, 0.50)]),
+            curve([(0.90, 0.50), (0.80, 0.28), (0.62, 0.36), (0.52, 0.46)]),
+        )
+    ).reversed()
     through = [slot((0.58, 0.17), (0.78, 0.17), 0.055), circle((0.09, 0.62), 0.045)]
     floor = Profile(outline, (*through, circle(middle, bore)))
     step = Profile(outline, (*through, circle(middle, hub), rib))
@@ -102,11 +113,13 @@ def demo_outline():
     left, right = (0.0, 0.0), (1.0, 0.0)
     high_right, high_left = (1.0, 0.55), (0.0, 0.72)
     side = curve([high_right, (0.72, 0.86), (0.50, 0.48), high_left])
-    return join([
-        corner_arc(high_left, left, right, 0.14),
-        corner_arc(left, right, high_right, 0.10),
-        side,
-    ])
+    return join(
+        [
+            corner_arc(high_left, left, right, 0.14),
+            corner_arc(left, right, high_right, 0.10),
+            side,
+        ]
+    )
 
 
 PARTS = {"block": block, "bracket": bracket, "wave": wave, "knob": knob, "demo": demo}

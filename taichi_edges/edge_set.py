@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from taichi_edges.artefacts import write_json
-from taichi_edges.edges.bezier import bezier_lengths, evaluate_bezier
+from taichi_edges.bezier import bezier_lengths, evaluate_bezier
 from taichi_edges.errors import UserError
 
 
@@ -39,7 +39,9 @@ class EdgeSet:
     @property
     def lengths(self):
         """(L + C,) arc lengths, lines first."""
-        return np.concatenate([np.linalg.norm(self.lines[:, 1] - self.lines[:, 0], axis=1), bezier_lengths(self.curves)])
+        return np.concatenate(
+            [np.linalg.norm(self.lines[:, 1] - self.lines[:, 0], axis=1), bezier_lengths(self.curves)]
+        )
 
     def transformed(self, function):
         """The same edges with `function`, (n, 3) -> (n, 3), an affine map, applied to every point."""
