@@ -6,7 +6,7 @@ from pathlib import Path
 from taichi_edges.errors import UserError
 from taichi_edges.pipeline import STAGES, Run, expand, run_stages
 from taichi_edges.progress import make_progress
-from taichi_edges.scene import load_scene
+from taichi_edges.scene_file import load_scene
 
 MOST_THREADS = 256  # each has an image of its own to draw into
 

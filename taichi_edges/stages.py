@@ -142,9 +142,6 @@ def _start(run, views, generator):
             return voted
         run.progress.warn("too few places where the views agree on an edge; the training starts from random points")
     if config.seeds == "points":
-        if not run.path("seeds.ply").exists():
-            problem = "points need a file to come from"
-            raise UserError(f"train.seeds: {problem}; name it in source.points, or set train.seeds to random")
         given = stack_fields(read_vertices(run.path("seeds.ply"), ("x", "y", "z")), ("x", "y", "z"))
         points = given_points(views.similarity.to_unit(given.astype(np.float64)), config.gaussians, generator)
     else:

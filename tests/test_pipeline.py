@@ -29,7 +29,7 @@ from taichi_edges.findings import FINDINGS
 from taichi_edges.pipeline import STAGES, Run, run_stages
 from taichi_edges.progress import PlainProgress, TerminalProgress
 from taichi_edges.readers.points import read_points
-from taichi_edges.scene import check_scene, load_scene, parse_yaml
+from taichi_edges.scene_file import check_scene, load_scene, parse_yaml
 from taichi_edges.splatting.seeding import given_points
 from taichi_edges.stages import evaluate
 from taichi_edges.views import Views, read_views, write_views

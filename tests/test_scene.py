@@ -6,7 +6,8 @@ import pytest
 import yaml
 
 from taichi_edges.errors import UserError
-from taichi_edges.scene import PRESETS, SceneConfig, load_scene
+from taichi_edges.scene import PRESETS, SceneConfig
+from taichi_edges.scene_file import load_scene
 
 SCENES = sorted((Path(__file__).parent.parent / "scenes").glob("*.yaml"))
 SYNTHETIC = "source: {reader: synthetic, part: block}\n"
