@@ -123,6 +123,17 @@ def test_a_gap_beyond_max_gap_separates():
     assert set(grow_clusters(*pieces, ClusterConfig(max_gap=0.15, neighbors=30))) == {0}
 
 
+@pytest.mark.parametrize(("step", "followed"), [(6.0, True), (22.0, False)])
+def test_an_edge_is_followed_round_a_gentle_bend_but_not_round_a_tight_one(step, followed):
+    """Every neighbour agrees with the next one (cos 22 degrees = 0.93); the edge grown so far is what objects."""
+    turn = np.radians(step) * np.arange(14)
+    radius = 0.01 / (2 * np.sin(np.radians(step) / 2))  # 1 cm from point to point
+    points = radius * np.stack([np.sin(turn), 1 - np.cos(turn), 0 * turn], axis=1)
+    directions = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    labels = grow_clusters(points, directions, ClusterConfig(theta=0.8, min_points=2, neighbors=2, max_gap=0.012))
+    assert (len(set(labels)) == 1) == followed
+
+
 def test_larger_clusters_come_first_and_small_ones_are_left_out():
     shapes = joined(
         noisy_line((0, 0, 0), (0.1, 0, 0), 9),
