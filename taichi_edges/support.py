@@ -41,10 +41,15 @@ def line_width(views, threshold):
         distances += float(cv2.distanceTransform(edges, cv2.DIST_L2, 5).sum())
         pixels += int(edges.sum())
     width = max(4.0 * distances / max(pixels, 1) - 2.0, 1.0)
+    return float(width), float(width * pixel_size(views))
+
+
+def pixel_size(views):
+    """Size of a pixel at the middle of the scene box, unit-cube units: median over the views."""
     middle = views.box.mean(axis=0, keepdims=True)
     depths = np.array([views.project(middle, view)[1][0] for view in range(len(views))])
     in_front = np.maximum(depths, NEAR)  # a view that looks away says nothing about the scale
-    return float(width), float(width * np.median(in_front / views.intrinsics[:, 0, 0]))
+    return float(np.median(in_front / views.intrinsics[:, 0, 0]))
 
 
 def exclusive_support(views, points, threshold):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import taichi as ti
+from autodiff_splatting import make_splat_autodiff
 from reference_splatting import (
     INSIDE,
     NO_EDGES,
@@ -24,7 +25,6 @@ from reference_splatting import (
 )
 
 from taichi_edges.splatting.gaussians import Gaussians
-from taichi_edges.splatting.splat import make_splat_autodiff
 
 WIDTH, HEIGHT, NEIGHBORS = 50, 40, 4
 VIEWS = (OUTSIDE, OBLIQUE, INSIDE)

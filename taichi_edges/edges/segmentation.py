@@ -41,15 +41,15 @@ def stretches(points, min_points):
     ordering = order_points(points)
     order = np.argsort(ordering.arc, kind="stable")
     if ordering.closed:
-        # A loop has no natural start: cut once anywhere, then start again in the middle of what was found longest.
-        order = np.roll(order, -_middle_of_longest_cut(points[order]))
+        # A loop has no natural start: cut it once from anywhere, then start again at one of the cuts that were found.
+        order = np.roll(order, -_some_cut(points[order]))
     bounds, curved = cut_chain(points[order])
     groups = _joined(bounds, curved, min_points, ordering.closed)
     return [np.concatenate([order[a:b] for a, b in group]) for group in groups]
 
 
-def _middle_of_longest_cut(chain):
-    """A cut of the open chain, as a position to start the closed one from; 0 where there is none."""
+def _some_cut(chain):
+    """Position of a cut that an open chain gets at an end of a straight stretch; 0 where it gets none."""
     bounds, curved = cut_chain(chain)
     inner = [a for a, was, now in zip(bounds[1:-1], curved[:-1], curved[1:], strict=True) if was != now or not now]
     return inner[len(inner) // 2] if inner else 0

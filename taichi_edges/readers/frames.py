@@ -17,6 +17,7 @@ BOX_GRID = 9  # points along each side of the scene box that are looked for in e
 OFF_CENTRE = 0.25  # of the image's size: a principal point farther from the centre is worth a warning
 MOSTLY_EDGES = 0.5  # share of edge pixels from which on the maps must be black on white
 LEAVE_OUT = "or leave such views out with source.skip"
+TAIL_BYTES = 64  # some writers pad the file behind its end marker
 # What a whole file ends with; a decoder alone may fill the missing rows of a truncated file with grey.
 END_MARKERS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
@@ -224,8 +225,10 @@ def _folders(frames):
 
 def is_whole(path):
     """Does the file end as a whole file of its kind ends? Formats without a known end marker pass."""
-    marker, content = END_MARKERS.get(path.suffix.lower()), path.read_bytes()
-    return bool(content) and (marker is None or marker in content[-64:])
+    marker, size = END_MARKERS.get(path.suffix.lower()), path.stat().st_size
+    with open(path, "rb") as file:
+        file.seek(max(size - TAIL_BYTES, 0))
+        return size > 0 and (marker is None or marker in file.read())
 
 
 def read_grey(path):

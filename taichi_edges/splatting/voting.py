@@ -8,7 +8,7 @@ import taichi as ti
 from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
-from taichi_edges.support import exclusive_support
+from taichi_edges.support import exclusive_support, pixel_size
 
 STEPS_PER_PIXEL = 4  # distances are kept in quarter pixels, one byte each
 HALF_DIAGONAL = np.sqrt(3) / 2  # of a unit cell
@@ -23,13 +23,12 @@ LEAST_SUPPORT = 0.05  # share of the views whose edge pixels are a seed's own (s
 
 @dataclass(frozen=True)
 class Seeds:
-    """points: (n, 3) unit cube. scores: (n,) 0..1. directions: (n, 3) unit vectors along the local line of seeds.
+    """points: (n, 3) unit cube. directions: (n, 3) unit vectors along the local line of seeds.
 
     pixel: size of a pixel at the scene, unit-cube units.
     """
 
     points: np.ndarray
-    scores: np.ndarray
     directions: np.ndarray
     pixel: float
 
@@ -93,13 +92,6 @@ def count_votes(
         scores[i] = score / ti.cast(count, ti.f32)
 
 
-def pixel_size(views):
-    """Size of a pixel at the middle of the box, unit-cube units: median over the views."""
-    middle = views.box.mean(axis=0, keepdims=True)
-    depths = np.array([views.project(middle, view)[1][0] for view in range(len(views))])
-    return float(np.median(np.maximum(depths, 0.05) / views.intrinsics[:, 0, 0]))
-
-
 def vote_seeds(views, threshold, generator):
     """Seeds of the whole scene box. ti.init must have been called. generator: jitters the finest cells."""
     distances = distance_maps(views.edge_maps, threshold)
@@ -131,10 +123,10 @@ def vote_seeds(views, threshold, generator):
     chance = np.quantile(votes_of(anywhere, 1.0, 0.0)[1], CHANCE_QUANTILE)
     points, scores = points[scores > chance], scores[scores > chance]
     best = nearly_best(points, scores, SUPPRESS_PX * pixel)
-    points, scores = points[best], scores[best]
+    points = points[best]
     own = exclusive_support(views, points, threshold) >= LEAST_SUPPORT
-    points, scores = points[own], scores[own]
-    return Seeds(points, scores, line_directions(points, 8 * pixel), pixel)
+    points = points[own]
+    return Seeds(points, line_directions(points, 8 * pixel), pixel)
 
 
 def nearly_best(points, scores, radius):
