@@ -49,24 +49,31 @@ class LearningRates(Section):
 
 
 class DensityConfig(Section):
-    """Culling and duplication "at regular intervals" (supplement): the epochs after which they happen."""
+    """Culling and duplication "at regular intervals" (supplement): the shares of the run after which they happen."""
 
-    duplicate_epochs: list[Count] = Field([*range(40, 161, 10)], description="epochs")
+    duplicate_at: list[Share] = Field([n / 50 for n in range(4, 17)], description="shares of the run")
     duplicate_gradient: Share = Field(0.5, description="relative positional gradient from which on to duplicate")
     duplicate_copies: Annotated[int, Field(ge=0)] = Field(2, description="copies of each")
     duplicate_distance: NotNegative = Field(0.01, description="standard deviation of a copy's offset, unit-cube units")
     max_gaussians: Count = Field(50_000, description="no duplication beyond this number")
-    cull_opacity_epochs: list[Count] = Field([125, 310, 450], description="epochs")
+    cull_opacity_at: list[Share] = Field([0.25, 0.62, 0.9], description="shares of the run")
     min_opacity: Share = Field(0.05, description="Gaussians below are culled")
-    cull_support_epochs: list[Count] = Field([100, 150, 200, 250, 350, 450], description="epochs")
+    cull_support_at: list[Share] = Field([0.2, 0.3, 0.4, 0.5, 0.7, 0.9], description="shares of the run")
     min_support: Share = Field(0.05, description="share of the views whose edge pixels a centre must hit")
     reset_opacity: bool = Field(True, description="opacities down to the initial one after a cull")
 
 
 class TrainConfig(Section):
-    """Training of the Gaussians (paper 3.1, 3.2, supplement)."""
+    """Training of the Gaussians (paper 3.1, 3.2, supplement).
 
-    epochs: Count = Field(500, description="passes over all views")
+    A run is as long as `epochs` or `steps` says; when things happen in it is written in shares of the run.
+    """
+
+    epochs: Annotated[int, Field(ge=0)] = Field(500, description="passes over all views; 0: train.steps counts")
+    steps: Annotated[int, Field(ge=0)] = Field(0, description="view steps; 0: train.epochs counts")
+    settled: Share = Field(
+        0.0, description="stop when a pass over the views lowers the loss by no more than this share; 0: never"
+    )
     gaussians: Count = Field(10_000, description="number of random points to start from")
     seeds: Literal["random", "points", "votes"] = Field(
         "random", description="random points in the box, source.points, or where many views agree on an edge"
@@ -77,18 +84,24 @@ class TrainConfig(Section):
         0.5, description="of full scale; from here on a pixel is an edge pixel"
     )
     loss: Literal["balanced", "class_weighted", "whole_image"] = Field("balanced", description="balanced is eq. 3")
-    only_means_epochs: Annotated[int, Field(ge=0)] = Field(30, description="epochs that train positions only")
+    only_means: Share = Field(0.06, description="share of the run that trains positions only")
     learning_rates: LearningRates = LearningRates()
     means_decay: Positive = Field(0.75, description="factor on the rate of the means")
-    means_decay_epochs: Count = Field(10, description="epochs between two decays")
+    means_decay_every: Positive = Field(0.02, description="share of the run between two decays")
     means_decays: Annotated[int, Field(ge=0)] = Field(5, description="number of decays")
-    regularize_from_epoch: Annotated[int, Field(ge=0)] = Field(300, description="L_orient and L_shape start here")
+    regularize_from: Share = Field(0.6, description="share of the run after which L_orient and L_shape start")
     regularize_every: Count = Field(10, description="steps")
     orient_weight: NotNegative = Field(0.1, description="lambda_1 of eq. 6; 0.01 for large scenes")
     shape_weight: NotNegative = Field(0.1, description="lambda_2 of eq. 6; 0.01 for large scenes")
     neighbors: Annotated[int, Field(ge=1, le=16)] = Field(4, description="k of eq. 4")
     neighbors_refresh_steps: Count = Field(100, description="steps between two neighbour searches")
     density: DensityConfig = DensityConfig()
+
+    @model_validator(mode="after")
+    def _has_one_length(self):
+        if bool(self.epochs) == bool(self.steps):
+            raise ValueError("the length is given in epochs or in steps; set one of them, and the other to 0")
+        return self
 
 
 class FilterConfig(Section):
@@ -127,7 +140,7 @@ class SceneConfig(Section):
     """A whole scene."""
 
     name: Name = Field("scene", description="folder of the results; the file's name unless set")
-    preset: Literal["paper", "fast"] = Field("paper", description="the schedule the scene starts from")
+    preset: Literal["fast", "paper"] = Field("fast", description="the schedule the scene starts from")
     seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of every random choice")
     box: Annotated[list[Point], Field(min_length=2, max_length=2)] = Field(
         [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], description="opposite corners of the scene, input units"
@@ -155,48 +168,52 @@ class SceneConfig(Section):
         return self
 
 
-# The schedule of the paper and its supplement, key by key; what it does not name keeps the scene's value.
+# Key by key; what a preset does not name keeps the scene's value.
 PRESETS = {
+    # The schedule of the paper and its supplement, 500 epochs: 30 are a share of 0.06, 300 of 0.6.
     "paper": {
         "train": {
             "epochs": 500,
+            "steps": 0,
+            "settled": 0.0,
             "gaussians": 10_000,
             "seeds": "random",
             "initial_scale": 0.004,
             "initial_opacity": 0.08,
             "loss": "balanced",
-            "only_means_epochs": 30,
+            "only_means": 0.06,
             "learning_rates": {"means": 1e-3, "scales": 2e-4, "opacities": 3e-2, "quaternions": 1e-3},
             "means_decay": 0.75,
-            "means_decay_epochs": 10,
+            "means_decay_every": 0.02,
             "means_decays": 5,
-            "regularize_from_epoch": 300,
+            "regularize_from": 0.6,
             "regularize_every": 10,
             "orient_weight": 0.1,
             "shape_weight": 0.1,
             "neighbors": 4,
-            # The paper leaves the intervals open; those in epochs belong to its 500 epochs.
-            "density": DensityConfig().model_dump(),
+            "density": DensityConfig().model_dump(),  # the paper leaves the intervals open
         }
     },
     # Seeded where the views agree, so that a few passes are enough: faster rates, one smooth decay, no duplication.
     "fast": {
         "train": {
-            "epochs": 20,
+            "epochs": 0,
+            "steps": 1000,
+            "settled": 0.0,
             "gaussians": 10_000,
             "seeds": "votes",
             "initial_opacity": 0.3,
             "loss": "balanced",
-            "only_means_epochs": 3,
+            "only_means": 0.15,
             "learning_rates": {"means": 2e-3, "scales": 5e-3, "opacities": 3e-2, "quaternions": 5e-3},
             "means_decay": 0.84,
-            "means_decay_epochs": 1,
+            "means_decay_every": 0.05,
             "means_decays": 20,
-            "regularize_from_epoch": 10,
+            "regularize_from": 0.5,
             "density": {
-                "duplicate_epochs": [],
-                "cull_opacity_epochs": [14],
-                "cull_support_epochs": [10, 15],
+                "duplicate_at": [],
+                "cull_opacity_at": [0.7],
+                "cull_support_at": [0.5, 0.75],
                 "reset_opacity": False,
             },
         }

@@ -65,6 +65,15 @@ def merge(base, over):
     }
 
 
+def overlay(base, over):
+    """`merge`, where a length of the training given in epochs replaces one in steps and the other way round."""
+    merged, train = merge(base, over), over.get("train")
+    given = [key for key in ("epochs", "steps") if isinstance(train, dict) and train.get(key)]
+    if len(given) == 1:
+        merged["train"] = {**merged["train"], "steps" if given == ["epochs"] else "epochs": 0}
+    return merged
+
+
 def load_scene(path, preset=None, settings=(), seed=None):
     """Read and check a scene file.
 
@@ -83,19 +92,19 @@ def load_scene(path, preset=None, settings=(), seed=None):
         what = "it is empty" if content is None else f"this is {_in_yaml(content)}"
         raise UserError(f"{path}: {what}, but a scene is a mapping of keys; see scenes/demo.yaml for an example")
     content = {"name": path.stem, **content}
-    base = content.get("preset", "paper")
-    content = merge(PRESETS.get(base, {}) if isinstance(base, str) else {}, content)
+    base = content.get("preset", SceneConfig.model_fields["preset"].default)
+    content = overlay(PRESETS.get(base, {}) if isinstance(base, str) else {}, content)
     if preset is not None:
         if preset not in PRESETS:
             raise UserError(f"--preset {preset}: there is no such preset; there is {', '.join(PRESETS)}")
-        content = merge(content, {"preset": preset, **PRESETS[preset]})
+        content = overlay(content, {"preset": preset, **PRESETS[preset]})
     origins = {}
     for setting in settings:
         keys, value = _parse_setting(setting)
         origins[keys] = f"--set {setting}"
         for name in reversed(keys):
             value = {name: value}
-        content = merge(content, value)
+        content = overlay(content, value)
     if seed is not None:
         content["seed"] = seed
         origins[("seed",)] = f"--seed {seed}"

@@ -114,8 +114,8 @@ def train(run):
     start = _start(run, views, generator)
     training = Training(views, config, generator, run.threads, run.arch)
     gaussians, records = training.run(start, run.progress)
-    rows = [("epoch", "seconds", "loss", "gaussians")]
-    rows += [(r.epoch, f"{r.seconds:.3f}", f"{r.loss:.6f}", r.gaussians) for r in records]
+    rows = [("step", "seconds", "loss", "gaussians")]
+    rows += [(r.step, f"{r.seconds:.3f}", f"{r.loss:.6f}", r.gaussians) for r in records]
     _write_csv(run.path("train_log.csv"), rows)
     similarity = views.similarity
     write_gaussians(
@@ -125,8 +125,8 @@ def train(run):
         gaussians.quaternions,
         gaussians.opacity_logits,
     )
-    loss = records[-1].loss if np.isfinite(records[-1].loss) else None  # an epoch may have measured none
-    return {"gaussians": len(gaussians), "view_steps": training.step, "final_loss": loss}
+    loss = records[-1].loss if np.isfinite(records[-1].loss) else None  # no step may have measured it alone
+    return {"gaussians": len(gaussians), "view_steps": records[-1].step, "final_loss": loss}
 
 
 def _start(run, views, generator):

@@ -170,9 +170,22 @@ def random_gaussians(count, generator, large=0):
 # What a Splatter has chosen ------------------------------------------------------------------------------------------
 
 
-def selected(splatter):
-    """Columns and rows (p, 2), weights and targets (p,) of the selected pixels."""
-    selection = splatter.selection
-    rows, columns = np.divmod(selection.pixels.to_numpy()[: selection.count], selection.width)
-    weights, targets = (field.to_numpy()[: selection.count] for field in (selection.weights, selection.targets))
-    return np.stack([columns, rows], axis=1), weights, targets
+def selected(splatter, page=0):
+    """Columns and rows (p, 2), weights and targets (p,) of the pixels selected in a page, in the order of the slots."""
+    selection, count = splatter.selection, int(splatter.selection.counts[page])
+    chosen = unpacked(selection.words.to_numpy()[page, :, :, 0])
+    rows, columns = np.nonzero(chosen)
+    np.testing.assert_array_equal(selection.columns.to_numpy()[page, :count], columns)
+    targets = selection.targets.to_numpy()[page, :count]
+    edges = splatter.images.maps.to_numpy()[selection.views[page], rows, columns] >= splatter.images.level
+    return np.stack([columns, rows], axis=1), np.where(edges, *splatter.weights(page)), targets
+
+
+def unpacked(masks):
+    """(H, words) uint32 -> (H, 32 words) bool, bit b of word w at column 32 w + b."""
+    return np.unpackbits(np.ascontiguousarray(masks, "<u4").view(np.uint8), axis=1, bitorder="little").astype(bool)
+
+
+def transmittance(splatter, page=0):
+    """(p,) T at the selected pixels of the page that was drawn last."""
+    return splatter.selection.transmittance.to_numpy()[: splatter.selection.counts[page]]

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import taichi as ti
-from autodiff_splatting import make_splat_autodiff
+from autodiff_splatting import AutodiffSplat
 from reference_splatting import (
     INSIDE,
     NO_EDGES,
@@ -22,6 +21,7 @@ from reference_splatting import (
     selected,
     shape_loss,
     slope,
+    transmittance,
 )
 
 from taichi_edges.splatting.gaussians import Gaussians
@@ -39,23 +39,6 @@ def gradients(splatter):
     """The gradients on the device, as Gaussians."""
     fields = splatter.fields
     return Gaussians(*(getattr(fields, name).grad.to_numpy()[: fields.count] for name in PARAMETERS))
-
-
-def record_with_autodiff(splatter, view):
-    """Splatter.record with the splat that Taichi differentiates itself instead of the hand adjoint."""
-    splatter.splats.splats.grad.fill(0)
-    splatter.selection.transmittance.grad.fill(0)
-    if not hasattr(splatter, "oracle"):
-        splatter.oracle = make_splat_autodiff(splatter.splats, splatter.selection)
-    clear, draw, gather = splatter.oracle
-    clear()
-    count = splatter.fields.count
-    with ti.ad.Tape(loss=splatter.loss, clear_gradients=False):
-        splatter._project(count, view, splatter.images.width, splatter.images.height)
-        draw(count)
-        gather(splatter.selection.count)
-        splatter._image_loss(splatter.selection.count)
-    splatter.selection.transmittance.grad.fill(0)
 
 
 def assert_gradients(actual, expected, tolerance):
@@ -84,7 +67,7 @@ def test_gradients_of_the_image_loss(open_splatter, seed, generator, view, large
     splatter.load(gaussians)
     splatter.select_pixels(view, 1)
     pixels = selected(splatter)
-    splatter.record(view) if record == "hand adjoint" else record_with_autodiff(splatter, view)
+    splatter.record() if record == "hand adjoint" else AutodiffSplat(splatter).record()
     expected = gradient(lambda moved: image_loss(moved, scene.camera(view), *pixels), gaussians)
     assert_gradients(gradients(splatter), expected, TOLERANCE["f64"])
 
@@ -94,11 +77,11 @@ def test_hand_adjoint_equals_taichis_own(open_splatter, seed, generator, view):
     splatter = open_splatter(random_scene(seed, WIDTH, HEIGHT))
     gaussians = random_gaussians(600, generator)
     results = []
-    for record in (splatter.record, lambda view: record_with_autodiff(splatter, view)):
+    for record in (splatter.record, AutodiffSplat(splatter).record):
         splatter.load(gaussians)
         splatter.select_pixels(view, 2)
-        record(view)
-        results.append((splatter.selection.transmittance.to_numpy()[: splatter.selection.count], gradients(splatter)))
+        plain = record()
+        results.append((transmittance(splatter) if plain is None else plain, gradients(splatter)))
     # A product against a sum of logarithms of some 100 factors: the rounding of 1e-16 for each of them. In the
     # gradients times up to 1e3 for 1 / (1 - a), times up to 1e3 in the projection of needles.
     np.testing.assert_allclose(results[0][0], results[1][0], rtol=1e-12, atol=1e-300)
@@ -118,7 +101,7 @@ def test_slope_of_the_image_loss_with_many_gaussians(open_splatter, seed, genera
     for view in VIEWS:
         splatter.load(gaussians)
         splatter.select_pixels(view, 4)
-        splatter.record(view)
+        splatter.record()
         computed, pixels = gradients(splatter), selected(splatter)
         for name in PARAMETERS:  # along the computed gradient itself, where nothing cancels
             still = {other: np.zeros_like(getattr(gaussians, other)) for other in PARAMETERS}
@@ -137,10 +120,10 @@ def test_gaussians_that_are_not_drawn_have_gradients_of_zero(open_splatter, seed
     scales[5] = 1e-5
     splatter.load(Gaussians(means, np.log(scales), np.tile([0.3, 0.1, -0.5, 0.2], (6, 1)), logits))
     splatter.select_pixels(OUTSIDE, 0)
-    splatter.record(OUTSIDE)
+    splatter.record()
     for name in PARAMETERS:
         np.testing.assert_array_equal(getattr(gradients(splatter), name), 0.0)
-    assert splatter.selection.transmittance.to_numpy()[: splatter.selection.count].min() == 1.0
+    assert transmittance(splatter).min() == 1.0
 
 
 def test_gradients_add_up_until_adam_has_used_them(open_splatter, seed, generator):
@@ -150,7 +133,7 @@ def test_gradients_add_up_until_adam_has_used_them(open_splatter, seed, generato
 
     def record(view):
         splatter.select_pixels(view, 5)
-        splatter.record(view, 0.5, 0.25)
+        splatter.record(0, 0.5, 0.25)
         return splatter.loss[None]
 
     parts, losses = [], []
@@ -177,7 +160,7 @@ def test_positional_gradients_add_up_absolute_pulls(open_splatter, seed, generat
     expected = np.zeros(40)
     for view in VIEWS:
         splatter.select_pixels(view, 6)
-        splatter.record(view)
+        splatter.record()
         pixels, weights, _ = selected(splatter)
         splats = project(gaussians, *scene.camera(view))
         a = alphas(splats, pixels)
@@ -202,7 +185,7 @@ def test_gradients_of_the_regularizers(open_splatter, seed, generator, count, we
     splatter.load(gaussians)
     splatter.neighbors.load(neighbors)
     splatter.select_pixels(NO_EDGES, 0)  # no pixels: the regularisers alone
-    splatter.record(NO_EDGES, *weights)
+    splatter.record(0, *weights)
 
     def loss(moved):
         return weights[0] * orient_loss(moved, neighbors) + weights[1] * shape_loss(moved)
@@ -223,7 +206,7 @@ def test_regularizers_and_image_loss_add_up(open_splatter, seed, generator):
         splatter.load(gaussians)
         splatter.neighbors.load(neighbors)
         splatter.select_pixels(view, 9)
-        splatter.record(view, *weights)
+        splatter.record(0, *weights)
         parts.append((splatter.loss[None], gradients(splatter)))
     assert parts[0][0] + parts[1][0] == pytest.approx(parts[2][0], rel=1e-5)
     total = Gaussians(*(getattr(parts[0][1], name) + getattr(parts[1][1], name) for name in PARAMETERS))
@@ -237,7 +220,7 @@ def test_orientation_pulls_neighbours_as_much_as_it_pulls_the_gaussian(open_spla
     splatter.neighbors.load(random_neighbors(600, generator))
     splatter.select_pixels(NO_EDGES, 0)
     for _ in range(2):  # what the neighbours were given is used up, and does not come twice
-        splatter.record(NO_EDGES, 1.0, 0.0)
+        splatter.record(0, 1.0, 0.0)
         means = gradients(splatter).means
         assert np.abs(means.sum(axis=0)).max() < 1e-13 * np.abs(means).sum()
 
@@ -248,7 +231,7 @@ def test_orientation_of_coinciding_gaussians_is_finite(open_splatter, seed, gene
     splatter.load(replace(gaussians, means=np.tile(gaussians.means[:1], (6, 1)), log_scales=np.zeros((6, 3))))
     splatter.neighbors.load(random_neighbors(6, generator))
     splatter.select_pixels(NO_EDGES, 0)
-    splatter.record(NO_EDGES, 1.0, 1.0)
+    splatter.record(0, 1.0, 1.0)
     assert splatter.loss[None] == pytest.approx(2.0)  # no alignment, and all scales are alike
     for name in PARAMETERS:
         assert np.isfinite(getattr(gradients(splatter), name)).all(), name
@@ -294,7 +277,7 @@ def test_two_runs_with_one_seed_are_equal_to_the_last_bit(open_splatter, seed, g
         for step, pixel_seed in enumerate(seeds):
             view = VIEWS[step % 3]
             splatter.select_pixels(view, pixel_seed)
-            splatter.record(view, *((0.1, 0.1) if step % 5 == 0 else (0.0, 0.0)))
+            splatter.record(0, *((0.1, 0.1) if step % 5 == 0 else (0.0, 0.0)))
             splatter.update(step + 1, 1e-3, 2e-4, 1e-3, 3e-2)
         runs.append((splatter.fields.gaussians(), splatter.fields.moments()))
     for name in PARAMETERS:

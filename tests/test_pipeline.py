@@ -52,14 +52,15 @@ ARTEFACTS = (
     "truth.json",
 )
 SCENE = """
+preset: paper
 source: {reader: synthetic, part: block, views: 12, size: 112}
 train:
   epochs: 40
   gaussians: 1200
-  only_means_epochs: 15
-  regularize_from_epoch: 30
+  only_means: 0.375
+  regularize_from: 0.75
   learning_rates: {means: 0.005, scales: 0.001, quaternions: 0.01}
-  density: {duplicate_epochs: [], cull_opacity_epochs: [25], cull_support_epochs: [30]}
+  density: {duplicate_at: [], cull_opacity_at: [0.625], cull_support_at: [0.75]}
 filter: {min_opacity: 0.05}
 cluster: {max_gap: 0.1, min_points: 5}
 fit: {line_tolerance: 0.015}
@@ -255,7 +256,7 @@ def test_all_artefacts_are_there_and_can_be_read(finished):
     assert len(edges) > 0 and about["frame"] == "input" and about["seed"] == 0
     assert (folder / "gaussians.ply").read_bytes().startswith(b"ply\n")
     log = list(csv.DictReader((folder / "train_log.csv").open()))
-    assert [row["epoch"] for row in log] == [str(epoch) for epoch in range(1, 41)]
+    assert [int(row["step"]) for row in log] == [*range(50, 480, 50), 480]
     assert left_behind(folder) == []
 
 

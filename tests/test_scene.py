@@ -51,13 +51,13 @@ def test_the_paper_preset_has_the_numbers_of_the_supplement():
     assert train["gaussians"] == 10_000  # "10000 points randomly sampled in a unit cube"
     assert (train["initial_scale"], train["initial_opacity"]) == (0.004, 0.08)
     assert train["epochs"] == 500
-    assert train["only_means_epochs"] == 30  # "For the first 30 epochs, we only train the position parameters"
+    assert train["only_means"] * 500 == 30  # "For the first 30 epochs, we only train the position parameters"
     assert train["learning_rates"] == {"means": 1e-3, "scales": 2e-4, "opacities": 3e-2, "quaternions": 1e-3}
     # "scaled with a factor of 0.75 every 10 epochs, 5 times"
-    assert (train["means_decay"], train["means_decay_epochs"], train["means_decays"]) == (0.75, 10, 5)
+    assert (train["means_decay"], train["means_decay_every"] * 500, train["means_decays"]) == (0.75, 10, 5)
     assert train["neighbors"] == 4  # k of eq. 4
     assert (train["orient_weight"], train["shape_weight"]) == (0.1, 0.1)  # object level scenes
-    assert (train["regularize_from_epoch"], train["regularize_every"]) == (300, 10)
+    assert (train["regularize_from"] * 500, train["regularize_every"]) == (300, 10)
     assert train["loss"] == "balanced"  # eq. 3
 
 
@@ -151,17 +151,22 @@ def test_whole_numbers_are_read(scene, written, read):
         ("fit: {min_length: '1e-3'}", "fit.min_length: must be a number, not '1e-3'"),
         ("fit: {delta: .nan}", "fit.delta: must be a finite number, not nan"),
         ("fit: {delta: 1e999}", "fit.delta: must be a finite number, not inf"),
-        ("train: {epochs: true}", "train.epochs: must be a whole number, not true (passes over all views)"),
+        (
+            "train: {epochs: true}",
+            "train.epochs: must be a whole number, not true (passes over all views; 0: train.steps counts)",
+        ),
         ("train: {epochs: 1.5}", "train.epochs: must be a whole number, not 1.5"),
         ('train: {epochs: "5"}', "train.epochs: must be a whole number, not '5'"),
         ("train: {epochs: 010}", "train.epochs: must be a whole number"),
         ("train: {epochs: 1:30}", "train.epochs: must be a whole number, not '1:30'"),
-        ("train: {epochs: 0}", "train.epochs: must be at least 1, not 0"),
+        ("train: {epochs: -1}", "train.epochs: must be at least 0, not -1"),
+        ("train: {epochs: 0, steps: 0}", "train: the length is given in epochs or in steps; set one of them"),
+        ("train: {epochs: 9, steps: 9}", "train: the length is given in epochs or in steps; set one of them"),
         ("train: {epochs:}", "train.epochs: must be a whole number, not null"),
         ("cluster: {theta: 80}", "cluster.theta: must be at most 1, not 80"),
         ("train: {initial_scale: 0}", "train.initial_scale: must be greater than 0, not 0"),
         ("train: {density: {reset_opacity: 1}}", "train.density.reset_opacity: must be true or false, not 1"),
-        ("train: {density: {duplicate_epochs: [0]}}", "train.density.duplicate_epochs.0: must be at least 1, not 0"),
+        ("train: {density: {duplicate_at: [2]}}", "train.density.duplicate_at.0: must be at most 1, not 2"),
         ("train: {loss: balance}", "train.loss: must be 'balanced', 'class_weighted' or 'whole_image', not 'balance'"),
         ("train:", "train: must be a section with keys of its own, not null"),
         ("train: [1]", "train: must be a section with keys of its own"),
@@ -173,8 +178,8 @@ def test_whole_numbers_are_read(scene, written, read):
         ("box: 3", "box: must be a list"),
         ("box: [[0, 0, 0], [1, 1]]", "box.1: must have 3 entries, not 2"),
         ("box: [[0, 0, 0], [1, 1, 0]]", "box: the second corner must be greater than the first"),
-        ("preset: papre", "preset: must be 'paper' or 'fast', not 'papre'"),
-        ("preset: [paper]", "preset: must be 'paper' or 'fast'"),
+        ("preset: papre", "preset: must be 'fast' or 'paper', not 'papre'"),
+        ("preset: [paper]", "preset: must be 'fast' or 'paper'"),
         ("3: 4", "3: a key must be a text"),
     ],
 )
@@ -252,8 +257,20 @@ def test_a_byte_order_mark_and_windows_line_ends_do_no_harm(tmp_path):
 # ------------------------------------------------------------------------------------------------------- precedence
 
 
+def test_a_length_in_epochs_replaces_one_in_steps_and_the_other_way_round(scene):
+    def length(text, **options):
+        train = load_scene(scene(text), **options).train
+        return train.epochs, train.steps
+
+    assert length("preset: fast\ntrain: {epochs: 7}") == (7, 0)
+    assert length("preset: paper\ntrain: {steps: 7}") == (0, 7)
+    assert length("preset: fast\ntrain: {epochs: 7}", settings=["train.steps=8"]) == (0, 8)
+    assert length("preset: paper\ntrain: {steps: 7}", settings=["train.epochs=8"]) == (8, 0)
+    assert length("train: {steps: 7}", preset="paper") == (500, 0)
+
+
 def test_the_scene_overrides_the_preset_key_by_key(scene):
-    config = load_scene(scene("train: {epochs: 7, learning_rates: {means: 0.5}}"))
+    config = load_scene(scene("preset: paper\ntrain: {epochs: 7, learning_rates: {means: 0.5}}"))
     rates = config.train.learning_rates
     assert (config.train.epochs, rates.means, rates.scales) == (7, 0.5, 2e-4)
 
@@ -276,7 +293,7 @@ def test_set_overrides_scene_and_preset(scene):
     ("setting", "value"),
     [
         ("train.learning_rates.means=1e-2", lambda c: c.train.learning_rates.means == 0.01),
-        ("train.density.duplicate_epochs=[]", lambda c: c.train.density.duplicate_epochs == []),
+        ("train.density.duplicate_at=[]", lambda c: c.train.density.duplicate_at == []),
         ("source.skip=[a, b]", lambda c: c.source.skip == ["a", "b"]),
         ("fit={delta: 0.2}", lambda c: c.fit.delta == 0.2 and c.fit.min_length == 0.01),
         (" seed = 4", lambda c: c.seed == 4),

@@ -21,8 +21,8 @@ from reference_splatting import (
 )
 
 from taichi_edges.splatting.gaussians import Gaussians, rotation_matrices, start_gaussians
+from taichi_edges.splatting.projection import fast_exp2
 from taichi_edges.splatting.selection import pack_mask
-from taichi_edges.splatting.splat import fast_exp
 
 WIDTH, HEIGHT = 50, 40
 VIEWS = (OUTSIDE, OBLIQUE, INSIDE)
@@ -147,6 +147,40 @@ def test_mask_packs_bit_b_of_word_w_as_column_32_w_plus_b(generator):
     assert not unpacked[:, :, 71:].any()
 
 
+def assert_words(words, chosen):
+    """The masks are those of `chosen` (H, W), and with each stands the number of chosen pixels before its word."""
+    np.testing.assert_array_equal(words[:, :, 0], pack_mask(chosen[None])[0])
+    sizes = [row[first : first + 32].sum() for row in chosen for first in range(0, chosen.shape[1], 32)]
+    np.testing.assert_array_equal(words[:, :, 1].ravel(), np.concatenate([[0], np.cumsum(sizes)[:-1]]))
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_pages_hold_what_each_view_alone_would(open_splatter, seed, threads):
+    scene = random_scene(seed, WIDTH, HEIGHT)
+    splatter = open_splatter(scene, threads=threads)
+    views, seeds = [OUTSIDE, NO_EDGES, OBLIQUE, OUTSIDE, MOSTLY_EDGES], [3, 4, 5, 6, 7]
+    counts = splatter.select_pixels(views, seeds).copy()
+    together = [selected(splatter, page) for page in range(len(views))]
+    assert counts[1] == 0 and len(together[1][0]) == 0
+    for page, (view, pixel_seed) in enumerate(zip(views, seeds)):
+        assert splatter.select_pixels(view, pixel_seed) == counts[page]
+        for of_page, alone in zip(together[page], selected(splatter)):
+            np.testing.assert_array_equal(of_page, alone)
+
+
+def test_loss_and_gradients_are_those_of_the_page(open_splatter, seed, generator):
+    splatter = open_splatter(random_scene(seed, WIDTH, HEIGHT))
+    gaussians = random_gaussians(300, generator)
+    results = []
+    for views, page in (([OUTSIDE, OBLIQUE, INSIDE], 1), ([OBLIQUE], 0)):
+        splatter.load(gaussians)
+        splatter.select_pixels(views, [8] * len(views))
+        splatter.record(page)
+        results.append((splatter.loss[None], splatter.fields.means.grad.to_numpy()))
+    assert results[0][0] == results[1][0]
+    np.testing.assert_array_equal(results[0][1], results[1][1])
+
+
 def test_whole_image_weighs_every_pixel_alike(open_splatter, seed):
     scene = random_scene(seed, WIDTH, HEIGHT)
     splatter = open_splatter(scene, loss="whole_image")
@@ -186,7 +220,7 @@ def test_balanced_selection_has_all_edge_pixels_and_as_many_others(open_splatter
         np.testing.assert_allclose(targets, scene.edge_maps[view][rows, columns] / 255, rtol=1e-15)
         chosen = np.zeros(edges.shape, bool)
         chosen[rows, columns] = True
-        np.testing.assert_array_equal(splatter.selection.mask.to_numpy(), pack_mask(chosen[None])[0])
+        assert_words(splatter.selection.words.to_numpy()[0], chosen)
         choices.append(pixels)
     np.testing.assert_array_equal(choices[0], choices[1])
     if background == edges.sum():  # else the whole background is chosen, in another order
@@ -215,7 +249,7 @@ def test_a_view_without_edge_pixels_selects_none(open_splatter, seed, generator)
     splatter = open_splatter(random_scene(seed, WIDTH, HEIGHT))
     splatter.load(random_gaussians(20, generator))
     assert splatter.select_pixels(NO_EDGES, 0) == 0
-    splatter.record(NO_EDGES)
+    splatter.record()
     assert splatter.loss[None] == 0.0
 
 
@@ -226,7 +260,7 @@ def test_loss_is_the_twins(open_splatter, seed, generator, loss):
     splatter.load(gaussians)
     for view in (*VIEWS, MOSTLY_EDGES):
         splatter.select_pixels(view, 3)
-        splatter.record(view)
+        splatter.record()
         expected = image_loss(gaussians, scene.camera(view), *selected(splatter))
         assert splatter.loss[None] == pytest.approx(expected, abs=1e-11)  # a mean of |C - target|: as exact as C
 
@@ -238,7 +272,8 @@ def test_threshold_parts_edges_from_background_at_the_same_level_as_the_views(op
     splatter.select_pixels(0, 0)
     edges = np.flatnonzero(maps.ravel() >= 0.4 * 255)
     assert splatter.images.edge_counts[0] == len(edges)
-    np.testing.assert_array_equal(splatter.selection.pixels.to_numpy()[: len(edges)], edges)
+    columns, rows = selected(splatter)[0].T
+    assert np.isin(edges, rows * 16 + columns).all()
 
 
 # Gaussians ------------------------------------------------------------------------------------------------------------
@@ -280,20 +315,19 @@ def test_direction_is_the_axis_of_the_largest_scale(generator):
     np.testing.assert_allclose(np.abs((largest * gaussians.directions()).sum(axis=1)), 1, atol=1e-9)
 
 
-def test_fast_exp_is_exp_to_single_precision(start_taichi):
+def test_fast_exp2_is_a_power_of_two_to_single_precision(start_taichi):
     start_taichi("f32", 2)
 
     @ti.kernel
     def evaluate(x: ti.types.ndarray(dtype=ti.f32, ndim=1), y: ti.types.ndarray(dtype=ti.f32, ndim=1)):
         for i in range(x.shape[0]):
-            y[i] = fast_exp(x[i])
+            y[i] = fast_exp2(x[i])
 
-    exponents = np.linspace(-5.6, 0, 100_001, dtype=np.float32)  # exp(-5.6) is less than 1/255: no more is drawn
+    exponents = np.linspace(-115, 115, 1_000_001, dtype=np.float32)
     values = np.empty_like(exponents)
     evaluate(exponents, values)
-    # The polynomial's 1e-7; half a unit in the last place of x * log2(e), at most 8, times ln 2: 1.7e-7; as much again
-    # for the rounding of log2(e) itself; and two roundings at the end.
-    np.testing.assert_allclose(values, np.exp(exponents.astype(np.float64)), rtol=1e-7 + 2 * 1.7e-7 + 2 * 6e-8)
-    values = np.empty(2, np.float32)
-    evaluate(np.array([-80.0, -1e30], np.float32), values)
-    np.testing.assert_allclose(values, np.exp(-80.0), rtol=1e-5)
+    # The polynomial's 1e-7 and a rounding for each of its last two steps.
+    np.testing.assert_allclose(values, np.exp2(exponents.astype(np.float64)), rtol=1e-7 + 2 * 6e-8)
+    values = np.empty(3, np.float32)
+    evaluate(np.array([-1e30, -120.0, 1e30], np.float32), values)
+    np.testing.assert_allclose(values, [2.0**-120, 2.0**-120, 2.0**120], rtol=3e-7)

@@ -169,7 +169,7 @@ def test_the_last_neighbour_repeats_where_there_are_too_few(generator, count):
 )
 def test_learning_rates_are_the_supplements(epoch, means):
     others = (2e-4, 1e-3, 3e-2) if epoch >= 30 else (0.0, 0.0, 0.0)  # positions only for 30 epochs
-    assert rates(TrainConfig(), epoch) == pytest.approx((means, *others))
+    assert rates(TrainConfig(), epoch / 500) == pytest.approx((means, *others))
 
 
 # End to end -----------------------------------------------------------------------------------------------------------
@@ -187,18 +187,19 @@ def train(start_taichi, block, config):
 
 def test_training_finds_the_edges_of_a_block(start_taichi, block):
     """A short schedule with everything in it: positions alone, duplication, culls, regularisers."""
-    density = DensityConfig(duplicate_epochs=[25, 35], cull_opacity_epochs=[50], cull_support_epochs=[45])
+    density = DensityConfig(duplicate_at=[0.4, 0.55], cull_opacity_at=[0.75], cull_support_at=[0.7])
     config = TrainConfig(
         epochs=65,
         gaussians=300,
         initial_scale=0.01,
-        only_means_epochs=10,
-        regularize_from_epoch=55,
+        only_means=0.15,
+        regularize_from=0.85,
         density=density,
     )
     start, trained, records = train(start_taichi, block, config)
-    assert len(records) == 65 and records[-1].gaussians == len(trained)
-    assert records[25].gaussians > 300 > 0
+    assert [record.step for record in records] == [*range(50, 65 * 12, 50), 65 * 12]
+    assert records[-1].gaussians == len(trained)
+    assert records[7].gaussians > 300 > 0
     assert records[-1].loss < 0.5 * records[0].loss
     tree = cKDTree(block[1])
     opaque = trained.opacities > 0.5
@@ -210,9 +211,9 @@ def test_training_finds_the_edges_of_a_block(start_taichi, block):
 
 
 def test_the_same_seed_trains_the_same_gaussians(start_taichi, block):
-    density = DensityConfig(duplicate_epochs=[4], cull_opacity_epochs=[], cull_support_epochs=[6])
+    density = DensityConfig(duplicate_at=[0.5], cull_opacity_at=[], cull_support_at=[0.75])
     config = TrainConfig(
-        epochs=8, gaussians=1500, only_means_epochs=3, regularize_from_epoch=5, regularize_every=3, density=density
+        epochs=8, gaussians=1500, only_means=0.4, regularize_from=0.6, regularize_every=3, density=density
     )
     runs = [train(start_taichi, block, config) for _ in range(2)]
     for one, other in zip(vars(runs[0][1]).values(), vars(runs[1][1]).values()):

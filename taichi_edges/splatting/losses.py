@@ -1,21 +1,9 @@
-"""The paper's losses, differentiated by Taichi: L_proj (eq. 3), L_orient (eq. 4), L_shape (eq. 5), summed (eq. 6)."""
+"""The paper's regularisers, differentiated by Taichi: L_orient (eq. 4) and L_shape (eq. 5)."""
 
 import numpy as np
 import taichi as ti
 
 from taichi_edges.splatting.projection import rotation
-
-
-def make_image_loss(selection, loss):
-    """Kernel image_loss(slots): loss += sum over the slots of weight * |C - target|, C = 1 - T (eq. 3)."""
-    weights, targets, transmittance = selection.weights, selection.targets, selection.transmittance
-
-    @ti.kernel
-    def image_loss(slots: ti.i32):
-        for slot in range(slots):
-            loss[None] += weights[slot] * ti.abs(1.0 - transmittance[slot] - targets[slot])
-
-    return image_loss
 
 
 class NeighborFields:
@@ -49,7 +37,7 @@ class NeighborFields:
 
 
 def make_regularizers(gaussians, neighbors, loss):
-    """copy_neighbors(count) and regularize(count, orient_weight, shape_weight), for the tape in this order.
+    """regularize(count, orient_weight, shape_weight): both regularisers, added to `loss` (0-D ndarray), for the tape.
 
     L_orient as the text of 3.2 defines it: the principal direction d_i points towards the k nearest neighbours,
     1 - mean |d_i . (mu_i - mu_j)| / |mu_i - mu_j|. L_shape: the mean ratio of the second largest to the largest scale.
@@ -57,6 +45,8 @@ def make_regularizers(gaussians, neighbors, loss):
     means, log_scales, quaternions = gaussians.means, gaussians.log_scales, gaussians.quaternions
     indices, neighbor_means = neighbors.indices, neighbors.means
     users, user_starts, k = neighbors.users, neighbors.user_starts, neighbors.k
+    # A field of its own: the adjoint that Taichi makes for an ndarray reads the wrong memory on Vulkan.
+    total = ti.field(gaussians.real, shape=(), needs_grad=True)
 
     @ti.kernel
     def copy(count: ti.i32):
@@ -83,7 +73,7 @@ def make_regularizers(gaussians, neighbors, loss):
         gather(count)
 
     @ti.kernel
-    def regularize(count: ti.i32, orient_weight: gaussians.real, shape_weight: gaussians.real):
+    def sum_up(count: ti.i32, orient_weight: gaussians.real, shape_weight: gaussians.real):
         for i in range(count):
             axes = rotation(quaternions[i])
             s = ti.exp(log_scales[i])
@@ -99,6 +89,28 @@ def make_regularizers(gaussians, neighbors, loss):
             for j in ti.static(range(k)):
                 offset = means[i] - neighbor_means[i, j]
                 alignment += ti.abs(direction.dot(offset)) / ti.sqrt(offset.dot(offset) + 1e-12)
-            loss[None] += (orient_weight * (1.0 - alignment / k) + shape_weight * second / largest) / count
+            total[None] += (orient_weight * (1.0 - alignment / k) + shape_weight * second / largest) / count
 
-    return copy_neighbors, regularize
+    @ti.kernel
+    def move_total(loss: ti.types.ndarray(dtype=gaussians.real, ndim=0)):
+        loss[None] += total[None]
+        total[None] = 0.0
+
+    @ti.kernel
+    def take_gradient(loss_gradient: ti.types.ndarray(dtype=gaussians.real, ndim=0)):
+        total.grad[None] = loss_gradient[None]
+
+    @ti.ad.grad_replaced
+    def add_to_loss():
+        move_total(loss)
+
+    @ti.ad.grad_for(add_to_loss)
+    def add_to_loss_adjoint():
+        take_gradient(loss.grad)
+
+    def regularize(count, orient_weight, shape_weight):
+        copy_neighbors(count)
+        sum_up(count, orient_weight, shape_weight)
+        add_to_loss()
+
+    return regularize

@@ -1,4 +1,4 @@
-"""Projection of 3D Gaussians to 2D splats (EWA), differentiated by Taichi itself."""
+"""Projection of 3D Gaussians to 2D splats (EWA)."""
 
 import numpy as np
 import taichi as ti
@@ -8,18 +8,39 @@ ALPHA_MIN = 1.0 / 255.0  # a smaller contribution is not drawn
 ALPHA_MAX = 0.999
 BOX_SIGMAS = 3.0  # half size of a splat's box in standard deviations, cut earlier where alpha falls below ALPHA_MIN
 NEAR_PLANE = 0.05  # unit-cube units
+LOG2_E = 1.4426950408889634
+
+
+@ti.func
+def fast_exp2(x):
+    """2^x in f32, x brought into -120..120: minimax polynomial, off by 1e-7; with libm's exp a splat takes twice as long."""
+    bounded = ti.min(ti.max(x, -120.0), 120.0)
+    whole = ti.floor(bounded + 0.5)
+    f = bounded - whole
+    p = 1.32647271e-3 * f + 9.67151264e-3
+    p = p * f + 5.55073374e-2
+    p = p * f + 2.40222421e-1
+    p = p * f + 6.93146978e-1
+    p = p * f + 1.0
+    return p * ti.bit_cast((ti.cast(whole, ti.i32) + 127) << 23, ti.f32)
+
+
+@ti.func
+def exact_exp2(x):
+    """2^x in any precision, and differentiable."""
+    return ti.exp(x * (1.0 / LOG2_E))
 
 
 @ti.func
 def rotation(quaternion):
     """(4,) w, x, y, z of any length -> 3x3 rotation matrix."""
-    unit = quaternion / ti.sqrt(quaternion.dot(quaternion) + 1e-20)
-    w, x, y, z = unit[0], unit[1], unit[2], unit[3]
+    w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    two = 2.0 / (quaternion.dot(quaternion) + 1e-20)
     return ti.Matrix(
         [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            [1 - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)],
+            [two * (x * y + w * z), 1 - two * (x * x + z * z), two * (y * z - w * x)],
+            [two * (x * z - w * y), two * (y * z + w * x), 1 - two * (x * x + y * y)],
         ]
     )
 
@@ -51,45 +72,61 @@ class SplatFields:
         self.boxes = ti.Vector.field(4, ti.i32, shape=capacity)
 
 
-def make_project(gaussians, cameras, target):
-    """Kernel project(count, view, width, height): GaussianFields -> SplatFields; its `.grad` is Taichi's own."""
+def make_splat_of(gaussians, cameras, exp2):
+    """ti.func splat_of(i, view) -> (splat, blurred variances along u and v, depth) of a Gaussian. exp2: ti.func."""
     means, log_scales = gaussians.means, gaussians.log_scales
     quaternions, opacity_logits = gaussians.quaternions, gaussians.opacity_logits
     poses, pinholes = cameras.world_to_camera, cameras.pinhole
-    splats, boxes = target.splats, target.boxes
+
+    @ti.func
+    def splat_of(i, view):
+        pose, pinhole = poses[view], pinholes[view]
+        camera_rotation = pose[:, :3]
+        point = camera_rotation @ means[i] + pose[:, 3]
+        inverse_depth = 1.0 / ti.max(point[2], NEAR_PLANE)
+        x, y = point[0] * inverse_depth, point[1] * inverse_depth
+        # Columns of M = J R_camera R S; the 2D covariance is M M^T. J: Jacobian of the pinhole at the mean.
+        axes = camera_rotation @ rotation(quaternions[i])
+        jx, jy = pinhole[0] * inverse_depth, pinhole[1] * inverse_depth
+        scales = ti.Vector([exp2(LOG2_E * log_scales[i][j]) for j in ti.static(range(3))])
+        row_u = ti.Vector([jx * (axes[0, j] - x * axes[2, j]) * scales[j] for j in ti.static(range(3))])
+        row_v = ti.Vector([jy * (axes[1, j] - y * axes[2, j]) * scales[j] for j in ti.static(range(3))])
+        uu, uv, vv = row_u.dot(row_u), row_u.dot(row_v), row_v.dot(row_v)
+        blurred_uu, blurred_vv = uu + SCREEN_BLUR, vv + SCREEN_BLUR
+        inverse = 1.0 / (blurred_uu * blurred_vv - uv * uv)
+        # The blur spreads the splat; its opacity falls so that the integral stays (Mip-Splatting, eq. 9).
+        compensation = ti.sqrt(ti.max((uu * vv - uv * uv) * inverse, 1e-8))
+        opacity = compensation / (1.0 + exp2(-LOG2_E * opacity_logits[i]))
+        u, v = pinhole[0] * x + pinhole[2], pinhole[1] * y + pinhole[3]
+        splat = ti.Vector([u, v, blurred_vv * inverse, -uv * inverse, blurred_uu * inverse, opacity])
+        return splat, ti.Vector([blurred_uu, blurred_vv]), point[2]
+
+    return splat_of
+
+
+@ti.func
+def box_of(splat, variances, depth, width, height):
+    """(u0, u1, v0, v1) of the pixels that a splat may reach, ends exclusive; empty where it is not drawn."""
+    reach = ti.sqrt(ti.min(2.0 * ti.log(ti.max(splat[5] / ALPHA_MIN, 1.0)), BOX_SIGMAS * BOX_SIGMAS))
+    reach_u, reach_v = reach * ti.sqrt(variances[0]), reach * ti.sqrt(variances[1])
+    u0 = ti.max(0, ti.cast(ti.ceil(splat[0] - reach_u), ti.i32))
+    u1 = ti.min(width, ti.cast(ti.floor(splat[0] + reach_u), ti.i32) + 1)
+    v0 = ti.max(0, ti.cast(ti.ceil(splat[1] - reach_v), ti.i32))
+    v1 = ti.min(height, ti.cast(ti.floor(splat[1] + reach_v), ti.i32) + 1)
+    if depth < NEAR_PLANE or splat[5] < ALPHA_MIN or u1 <= u0 or v1 <= v0:
+        u1, v1 = u0, v0
+    return ti.Vector([u0, u1, v0, v1])
+
+
+def make_project(gaussians, cameras, target):
+    """Kernel project(count, view): GaussianFields -> SplatFields.splats; its `.grad` is Taichi's own."""
+    splats = target.splats
+    splat_of = make_splat_of(gaussians, cameras, exact_exp2)
 
     @ti.kernel
-    def project(count: ti.i32, view: ti.i32, width: ti.i32, height: ti.i32):
+    def project(count: ti.i32, view: ti.i32):
         for i in range(count):
-            pose, pinhole = poses[view], pinholes[view]
-            camera_rotation = pose[:, :3]
-            point = camera_rotation @ means[i] + pose[:, 3]
-            inverse_depth = 1.0 / ti.max(point[2], NEAR_PLANE)
-            x, y = point[0] * inverse_depth, point[1] * inverse_depth
-            # Columns of M = J R_camera R S; the 2D covariance is M M^T. J: Jacobian of the pinhole at the mean.
-            axes = camera_rotation @ rotation(quaternions[i])
-            scales = ti.exp(log_scales[i])
-            jx, jy = pinhole[0] * inverse_depth, pinhole[1] * inverse_depth
-            row_u = ti.Vector([jx * (axes[0, j] - x * axes[2, j]) * scales[j] for j in ti.static(range(3))])
-            row_v = ti.Vector([jy * (axes[1, j] - y * axes[2, j]) * scales[j] for j in ti.static(range(3))])
-            uu, uv, vv = row_u.dot(row_u), row_u.dot(row_v), row_v.dot(row_v)
-            blurred_uu, blurred_vv = uu + SCREEN_BLUR, vv + SCREEN_BLUR
-            determinant = blurred_uu * blurred_vv - uv * uv
-            inverse = 1.0 / determinant
-            # The blur spreads the splat; its opacity falls so that the integral stays (Mip-Splatting, eq. 9).
-            compensation = ti.sqrt(ti.max((uu * vv - uv * uv) * inverse, 1e-8))
-            opacity = compensation / (1.0 + ti.exp(-opacity_logits[i]))
-            u, v = pinhole[0] * x + pinhole[2], pinhole[1] * y + pinhole[3]
-            splats[i] = ti.Vector([u, v, blurred_vv * inverse, -uv * inverse, blurred_uu * inverse, opacity])
-            # The box: no gradient passes through integers.
-            reach = ti.sqrt(ti.min(2.0 * ti.log(ti.max(opacity / ALPHA_MIN, 1.0)), BOX_SIGMAS * BOX_SIGMAS))
-            reach_u, reach_v = reach * ti.sqrt(blurred_uu), reach * ti.sqrt(blurred_vv)
-            u0 = ti.max(0, ti.cast(ti.ceil(u - reach_u), ti.i32))
-            u1 = ti.min(width, ti.cast(ti.floor(u + reach_u), ti.i32) + 1)
-            v0 = ti.max(0, ti.cast(ti.ceil(v - reach_v), ti.i32))
-            v1 = ti.min(height, ti.cast(ti.floor(v + reach_v), ti.i32) + 1)
-            if point[2] < NEAR_PLANE or opacity < ALPHA_MIN or u1 <= u0 or v1 <= v0:
-                u1, v1 = u0, v0
-            boxes[i] = ti.Vector([u0, u1, v0, v1])
+            splat, variances, depth = splat_of(i, view)
+            splats[i] = splat
 
     return project

@@ -1,104 +1,92 @@
-"""The splat: order-independent blending at chosen pixels only, with an adjoint of its own.
+"""The splat: order-independent blending at the selected pixels only, compared with the edge map, with its own adjoint.
 
 Every edge Gaussian has colour 1 on black, so the image is C(p) = 1 - T(p) with the transmittance
-T(p) = prod_i (1 - a_i(p)), whatever the order. The loss looks at few pixels (paper eq. 3), so only those are evaluated:
-the selected pixels stand in a list of slots and in a bit mask over the image, 32 pixels a word.
+T(p) = prod_i (1 - a_i(p)), whatever the order. The loss looks at few pixels (paper eq. 3), so only those are evaluated.
 
-Forward: each Gaussian visits the set bits of its box. On a CPU every thread multiplies into an image of its own
-(`product`); on a GPU all add log(1 - a) into one image with atomics (`log`). Backward: each Gaussian gathers
-dL/da_i = -T(p) dL/dT(p) / (1 - a_i) from the same bits; nothing is written twice, so there are no atomics.
+Forward: each Gaussian is projected and visits the selected pixels in its box. On a CPU every thread multiplies into a
+plane of its own (`product`); on a GPU all add log(1 - a) into one with atomics (`log`). Then the planes are combined to
+T and compared with the edge map. Backward: each Gaussian gathers dL/da_i = -T dL/dT / (1 - a_i) from the same pixels,
+nothing is written twice, so there are no atomics; Taichi's own adjoint of the projection takes it to the parameters.
+
+A launch that wakes a second thread costs as much as 700 Gaussians, so what can be one kernel is one.
 """
 
 import taichi as ti
 
-from taichi_edges.splatting.projection import ALPHA_MAX, ALPHA_MIN
-from taichi_edges.splatting.selection import WORD
-
-BLOCK = 512  # Taichi's CPU backend gives a thread no fewer items of a range-for than this
-
-
-@ti.func
-def lowest_bit(bits):
-    """Index of the lowest set bit of a non-zero u32."""
-    return ti.cast(ti.math.popcnt((bits & (~bits + ti.u32(1))) - ti.u32(1)), ti.i32)
-
-
-@ti.func
-def word_in_box(mask: ti.template(), row, word, u0, u1):
-    """The mask's word with the bits outside columns u0..u1-1 cleared."""
-    bits = mask[row, word]
-    first = word * WORD
-    if first < u0:
-        bits &= ti.u32(0xFFFFFFFF) << ti.cast(u0 - first, ti.u32)
-    if first + WORD > u1:
-        bits &= ti.u32(0xFFFFFFFF) >> ti.cast(first + WORD - u1, ti.u32)
-    return bits
+from taichi_edges.splatting.projection import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    LOG2_E,
+    box_of,
+    exact_exp2,
+    fast_exp2,
+    make_project,
+    make_splat_of,
+)
+from taichi_edges.splatting.selection import BLOCK, slots_of
 
 
-@ti.func
-def fast_exp(x):
-    """exp of x <= 0 in f32: fifth-order minimax polynomial, off by 1e-7; libm's costs twice the splat."""
-    scaled = ti.max(x, -80.0) * 1.44269504
-    whole = ti.floor(scaled + 0.5)
-    f = scaled - whole
-    p = 1.32647271e-3 * f + 9.67151264e-3
-    p = p * f + 5.55073374e-2
-    p = p * f + 2.40222421e-1
-    p = p * f + 6.93146978e-1
-    p = p * f + 1.0
-    return p * ti.bit_cast((ti.cast(whole, ti.i32) + 127) << 23, ti.f32)
+def make_compare(gaussians, cameras, target, selection, loss, threads, schedule):
+    """compare(count, page, view, level, edge_weight, background_weight): Gaussians -> loss, for the tape.
 
-
-def make_splat(gaussians, target, selection, threads, schedule):
-    """splat(count): SplatFields -> transmittance of the selected slots, with its own adjoint registered for the tape.
-
-    schedule: 'product' (a private image for each of `threads` threads) or 'log' (atomic sums of logarithms).
-    The adjoint writes `splats.grad` (assigned, not added) and adds to `positional_gradients`.
+    L_proj (eq. 3) of the pixels selected in `page`, of which `view` says where they are seen from: the sum of
+    weight * |C - target|, added to `loss` (0-D ndarray with gradient). level: target from which on a pixel has the
+    weight of an edge pixel. schedule: 'product' (a private plane for each of `threads` threads) or 'log' (atomic sums
+    of logarithms). The adjoint adds to the gradients of `gaussians` and to its positional gradients.
     """
-    draw, combine = make_forward(target, selection, threads, schedule)
-    spread_adjoint, gather_adjoint = make_adjoint(gaussians, target, selection)
+    draw = make_draw(gaussians, cameras, target, selection, threads, schedule)
+    blend = make_blend(selection, schedule)
+    gather = make_gather(gaussians, target, selection)
+    project = make_project(gaussians, cameras, target)
 
     @ti.ad.grad_replaced
-    def splat(count):
-        draw(count, selection.mask, selection.planes)
-        combine(selection.count, selection.planes)
+    def compare(count, page, view, level, edge_weight, background_weight):
+        draw(count, page, view, selection.width, selection.height, selection.words)
+        blend(int(selection.counts[page]), page, level, edge_weight, background_weight, loss)
 
-    @ti.ad.grad_for(splat)
-    def splat_adjoint(count):
-        spread_adjoint(selection.count, selection.adjoint)
-        gather_adjoint(count, selection.mask, selection.adjoint)
+    @ti.ad.grad_for(compare)
+    def compare_adjoint(count, page, view, level, edge_weight, background_weight):
+        gather(count, page, selection.words, loss.grad)
+        project.grad(count, view)
 
-    return splat
+    return compare
 
 
-def make_forward(target, selection, threads, schedule):
-    """Kernels draw(count, mask, planes): splats into the planes, and combine(slots, planes): planes into slots."""
+def make_draw(gaussians, cameras, target, selection, threads, schedule):
+    """Kernel draw(count, page, view, width, height, words): Gaussians -> SplatFields and the selection's planes."""
     real = selection.real
     splats, boxes = target.splats, target.boxes
-    pixels, transmittance = selection.pixels, selection.transmittance
-    exp = fast_exp if real == ti.f32 else ti.exp
+    columns, planes = selection.columns, selection.planes
+    exp2 = fast_exp2 if real == ti.f32 else exact_exp2
+    splat_of = make_splat_of(gaussians, cameras, exp2)
 
     @ti.func
-    def draw(i, plane, mask: ti.template(), planes: ti.template()):
-        box, g = boxes[i], splats[i]
+    def draw_one(i, plane, page, view, width, height, words: ti.template()):
+        g, variances, depth = splat_of(i, view)
+        box = box_of(g, variances, depth, width, height)
+        splats[i], boxes[i] = g, box
+        a, b, c = -0.5 * LOG2_E * g[2], -LOG2_E * g[3], -0.5 * LOG2_E * g[4]
         for row in range(box[2], box[3]):
             dv = row - g[1]
-            for word in range(box[0] >> 5, ((box[1] - 1) >> 5) + 1):
-                bits = word_in_box(mask, row, word, box[0], box[1])
-                while bits != 0:
-                    column = word * WORD + lowest_bit(bits)
-                    bits &= bits - ti.u32(1)
-                    du = column - g[0]
-                    alpha = g[5] * exp(-0.5 * (g[2] * du * du + g[4] * dv * dv) - g[3] * du * dv)
+            start, end = slots_of(words, page, row, box[0], box[1])
+            for slot in range(start, end):
+                du = columns[page, slot] - g[0]
+                alpha = g[5] * exp2((a * du + b * dv) * du + c * dv * dv)
+                if ti.static(schedule == "log"):
                     if alpha >= ALPHA_MIN:
-                        if ti.static(schedule == "log"):
-                            ti.atomic_add(planes[plane, row, column], ti.log(1.0 - ti.min(alpha, ALPHA_MAX)))
-                        else:
-                            planes[plane, row, column] *= 1.0 - ti.min(alpha, ALPHA_MAX)
+                        ti.atomic_add(planes[plane, slot], ti.log(1.0 - ti.min(alpha, ALPHA_MAX)))
+                else:  # without a branch, which the processor would guess wrong half of the time
+                    drawn = ti.select(alpha >= ALPHA_MIN, ti.min(alpha, ALPHA_MAX), 0.0)
+                    planes[plane, slot] = planes[plane, slot] * (1.0 - drawn)  # `*=` would be atomic
 
     @ti.kernel
     def draw_product(
-        count: ti.i32, mask: ti.types.ndarray(dtype=ti.u32, ndim=2), planes: ti.types.ndarray(dtype=real, ndim=3)
+        count: ti.i32,
+        page: ti.i32,
+        view: ti.i32,
+        width: ti.i32,
+        height: ti.i32,
+        words: ti.types.ndarray(dtype=ti.u32, ndim=4),
     ):
         for item in range(threads * BLOCK):  # one block of items is one thread: plane `thread` is its own
             thread = item // BLOCK
@@ -106,80 +94,135 @@ def make_forward(target, selection, threads, schedule):
             i = thread * share + item % BLOCK
             end = ti.min((thread + 1) * share, count)
             while i < end:
-                draw(i, thread, mask, planes)
+                draw_one(i, thread, page, view, width, height, words)
                 i += BLOCK
 
     @ti.kernel
     def draw_log(
-        count: ti.i32, mask: ti.types.ndarray(dtype=ti.u32, ndim=2), planes: ti.types.ndarray(dtype=real, ndim=3)
+        count: ti.i32,
+        page: ti.i32,
+        view: ti.i32,
+        width: ti.i32,
+        height: ti.i32,
+        words: ti.types.ndarray(dtype=ti.u32, ndim=4),
     ):
         for i in range(count):
-            draw(i, 0, mask, planes)
+            draw_one(i, 0, page, view, width, height, words)
 
-    @ti.kernel
-    def combine(slots: ti.i32, planes: ti.types.ndarray(dtype=real, ndim=3)):
-        for slot in range(slots):
-            row = pixels[slot] // planes.shape[2]
-            column = pixels[slot] - row * planes.shape[2]
-            value = planes[0, row, column]
-            for plane in range(1, planes.shape[0]):
-                value *= planes[plane, row, column]
-            if ti.static(schedule == "log"):
-                value = ti.exp(value)
-            transmittance[slot] = value
-
-    return draw_log if schedule == "log" else draw_product, combine
+    return draw_log if schedule == "log" else draw_product
 
 
-def make_adjoint(gaussians, target, selection):
-    """Kernels spread_adjoint(slots, adjoint): T dL/dT from the slots to the image, and
-    gather_adjoint(count, mask, adjoint): from the image to the splats.
+def make_blend(selection, schedule):
+    """Kernel blend(slots, page, level, edge_weight, background_weight, loss): planes -> T, adjoint and loss.
+
+    Leaves the planes empty for the next view. Serial on a CPU: a few thousand slots do not pay for waking a thread, and
+    the sum is the same in every run.
     """
     real = selection.real
-    splats, boxes, positional = target.splats, target.boxes, gaussians.positional_gradients
-    pixels, transmittance = selection.pixels, selection.transmittance
-    exp = fast_exp if real == ti.f32 else ti.exp
+    planes, transmittance, adjoint = selection.planes, selection.transmittance, selection.adjoint
+    targets, count = selection.targets, selection.planes.shape[0]
+    empty = 0.0 if schedule == "log" else 1.0  # log T = 0 or T = 1
 
     @ti.kernel
-    def spread_adjoint(slots: ti.i32, adjoint: ti.types.ndarray(dtype=real, ndim=2)):
+    def clear():
+        for plane, slot in planes:
+            planes[plane, slot] = empty
+
+    @ti.func
+    def blend_one(slot, page, level, edge_weight, background_weight):
+        """weight * |C - target| of one slot."""
+        t = planes[0, slot]
+        planes[0, slot] = empty
+        for plane in ti.static(range(1, count)):
+            t *= planes[plane, slot]
+            planes[plane, slot] = empty
+        if ti.static(schedule == "log"):
+            t = ti.exp(t)
+        wanted = targets[page, slot]
+        weight = edge_weight if wanted >= level else background_weight
+        difference = 1.0 - t - wanted
+        side = 1.0 if difference > 0 else -1.0
+        if difference == 0:
+            side = 0.0
+        transmittance[slot] = t
+        adjoint[slot] = weight * side * t
+        return weight * ti.abs(difference)
+
+    @ti.kernel
+    def blend_serial(
+        slots: ti.i32,
+        page: ti.i32,
+        level: real,
+        edge_weight: real,
+        background_weight: real,
+        loss: ti.types.ndarray(dtype=real, ndim=0),
+    ):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            total = ti.cast(0.0, real)
+            for slot in range(slots):
+                total += blend_one(slot, page, level, edge_weight, background_weight)
+            loss[None] += total
+
+    @ti.kernel
+    def blend_parallel(
+        slots: ti.i32,
+        page: ti.i32,
+        level: real,
+        edge_weight: real,
+        background_weight: real,
+        loss: ti.types.ndarray(dtype=real, ndim=0),
+    ):
         for slot in range(slots):
-            row = pixels[slot] // adjoint.shape[1]
-            adjoint[row, pixels[slot] - row * adjoint.shape[1]] = transmittance.grad[slot] * transmittance[slot]
-            transmittance.grad[slot] = 0.0
+            loss[None] += blend_one(slot, page, level, edge_weight, background_weight)
+
+    clear()
+    return blend_parallel if schedule == "log" else blend_serial
+
+
+def make_gather(gaussians, target, selection):
+    """Kernel gather(count, page, words, loss_gradient): the slots' adjoints -> gradients of the splats (assigned)."""
+    real = selection.real
+    splats, boxes, positional = target.splats, target.boxes, gaussians.positional_gradients
+    columns, adjoint = selection.columns, selection.adjoint
+    exp2 = fast_exp2 if real == ti.f32 else exact_exp2
 
     @ti.kernel
-    def gather_adjoint(
-        count: ti.i32, mask: ti.types.ndarray(dtype=ti.u32, ndim=2), adjoint: ti.types.ndarray(dtype=real, ndim=2)
+    def gather(
+        count: ti.i32,
+        page: ti.i32,
+        words: ti.types.ndarray(dtype=ti.u32, ndim=4),
+        loss_gradient: ti.types.ndarray(dtype=real, ndim=0),
     ):
         for i in range(count):
             box, g = boxes[i], splats[i]
-            du_sum, dv_sum, a_sum, b_sum, c_sum, opacity_sum = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            du_absolute, dv_absolute = 0.0, 0.0
+            a, b, c = -0.5 * LOG2_E * g[2], -LOG2_E * g[3], -0.5 * LOG2_E * g[4]
+            # Sums over the pixels of dL / d(exponent) times 1, du, dv, du^2, du dv, dv^2.
+            one, u, v, uu, uv, vv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            u_absolute, v_absolute = 0.0, 0.0
             for row in range(box[2], box[3]):
                 dv = row - g[1]
-                for word in range(box[0] >> 5, ((box[1] - 1) >> 5) + 1):
-                    bits = word_in_box(mask, row, word, box[0], box[1])
-                    while bits != 0:
-                        column = word * WORD + lowest_bit(bits)
-                        bits &= bits - ti.u32(1)
-                        du = column - g[0]
-                        falloff = exp(-0.5 * (g[2] * du * du + g[4] * dv * dv) - g[3] * du * dv)
-                        alpha = g[5] * falloff
-                        if alpha >= ALPHA_MIN and alpha < ALPHA_MAX:
-                            d_alpha = -adjoint[row, column] / (1.0 - alpha)
-                            d_exponent = d_alpha * alpha
-                            opacity_sum += d_alpha * falloff
-                            a_sum -= 0.5 * d_exponent * du * du
-                            b_sum -= d_exponent * du * dv
-                            c_sum -= 0.5 * d_exponent * dv * dv
-                            towards_u = d_exponent * (g[2] * du + g[3] * dv)
-                            towards_v = d_exponent * (g[3] * du + g[4] * dv)
-                            du_sum += towards_u
-                            dv_sum += towards_v
-                            du_absolute += ti.abs(towards_u)
-                            dv_absolute += ti.abs(towards_v)
-            splats.grad[i] = ti.Vector([du_sum, dv_sum, a_sum, b_sum, c_sum, opacity_sum])
+                start, end = slots_of(words, page, row, box[0], box[1])
+                for slot in range(start, end):
+                    du = columns[page, slot] - g[0]
+                    alpha = g[5] * exp2((a * du + b * dv) * du + c * dv * dv)
+                    counts = alpha >= ALPHA_MIN and alpha < ALPHA_MAX
+                    d_exponent = ti.select(counts, adjoint[slot] * alpha / (1.0 - ti.min(alpha, ALPHA_MAX)), 0.0)
+                    along_u, along_v = d_exponent * du, d_exponent * dv
+                    one += d_exponent
+                    u += along_u
+                    v += along_v
+                    uu += along_u * du
+                    uv += along_u * dv
+                    vv += along_v * dv
+                    u_absolute += ti.abs(g[2] * along_u + g[3] * along_v)
+                    v_absolute += ti.abs(g[3] * along_u + g[4] * along_v)
+            scale = loss_gradient[None]
+            slopes = ti.Vector(
+                [g[2] * u + g[3] * v, g[3] * u + g[4] * v, -0.5 * uu, -uv, -0.5 * vv, one / ti.max(g[5], 1e-30)]
+            )
+            splats.grad[i] = scale * slopes
             # Absolute values, so that pulls to opposite sides add up instead of cancelling (AbsGS, 2024).
-            positional[i] += ti.sqrt(du_absolute * du_absolute + dv_absolute * dv_absolute)
+            positional[i] += scale * ti.sqrt(u_absolute * u_absolute + v_absolute * v_absolute)
 
-    return spread_adjoint, gather_adjoint
+    return gather

@@ -4,14 +4,15 @@ import numpy as np
 import taichi as ti
 
 from taichi_edges.splatting.gaussians import GaussianFields, round_capacity
-from taichi_edges.splatting.losses import NeighborFields, make_image_loss, make_regularizers
+from taichi_edges.splatting.losses import NeighborFields, make_regularizers
 from taichi_edges.splatting.optimizer import BETA1, BETA2, make_adam
-from taichi_edges.splatting.projection import CameraFields, SplatFields, make_project
+from taichi_edges.splatting.projection import CameraFields, SplatFields
 from taichi_edges.splatting.selection import PixelSelection, make_select, pack_mask
-from taichi_edges.splatting.splat import make_splat
+from taichi_edges.splatting.splat import make_compare
 
 LOSSES = ("balanced", "class_weighted", "whole_image")  # eq. 3 first; the other two are the options the paper names
 GPU_ARCHS = ("cuda", "vulkan")
+PAGES = 16  # views whose pixels are selected in one launch
 
 
 class EdgeImages:
@@ -62,13 +63,14 @@ class Splatter:
         self.images = EdgeImages(edge_maps, edge_threshold)
         self.cameras = CameraFields(np.asarray(intrinsics), np.asarray(world_to_camera), real)
         height, width = self.images.height, self.images.width
-        balanced = 2 * int(self.images.edge_counts.max())
-        slots = round_capacity(min(balanced, height * width) if loss == "balanced" else height * width)
-        planes = threads if schedule == "product" else 1
-        self.selection = PixelSelection(height, width, slots, planes, real)
-        self.loss = ti.field(real, shape=(), needs_grad=True)
-        self._select_balanced, self._select_all = make_select(self.selection, schedule)
-        self._image_loss = make_image_loss(self.selection, self.loss)
+        balanced = loss == "balanced"
+        slots = round_capacity(
+            min(2 * int(self.images.edge_counts.max()), height * width) if balanced else height * width
+        )
+        pages, planes = PAGES if balanced else 1, threads if schedule == "product" else 1
+        self.selection = PixelSelection(height, width, slots, pages, planes, real)
+        self.loss = ti.ndarray(real, shape=(), needs_grad=True)  # a field would take the tape two launches to reset
+        self._select = make_select(self.selection, threads, schedule)
         self._neighbor_count = neighbors
         self._allocate(round_capacity(capacity))
 
@@ -77,9 +79,9 @@ class Splatter:
         self.fields = GaussianFields(capacity, self.real)
         self.splats = SplatFields(capacity, self.real)
         self.neighbors = NeighborFields(capacity, self._neighbor_count, self.real)
-        self._project = make_project(self.fields, self.cameras, self.splats)
-        self._splat = make_splat(self.fields, self.splats, self.selection, self.threads, self.schedule)
-        self._copy_neighbors, self._regularize = make_regularizers(self.fields, self.neighbors, self.loss)
+        arguments = (self.fields, self.cameras, self.splats, self.selection, self.loss, self.threads, self.schedule)
+        self._compare = make_compare(*arguments)
+        self._regularize = make_regularizers(self.fields, self.neighbors, self.loss)
         self._adam = make_adam(self.fields)
 
     def load(self, gaussians, moments=(None, None)):
@@ -88,36 +90,47 @@ class Splatter:
             self._allocate(round_capacity(len(gaussians)))
         self.fields.load(gaussians, *moments)
 
-    def select_pixels(self, view, seed):
-        """Choose the view's pixels for the loss. Returns how many there are (0: the map has no edge pixel)."""
-        images, selection = self.images, self.selection
-        pixel_count = images.height * images.width
-        edges = int(images.edge_counts[view])
-        background = min(edges, pixel_count - edges)
-        if self.loss_mode == "balanced":
-            selection.count = edges + background
-            arguments = (images.maps, images.words, images.pixels, selection.mask, selection.planes)
-            place = (int(images.starts[view]), edges, background, int(seed))
-            # Also for no pixels: it empties the mask, or the adjoint would visit the pixels of the view before.
-            self._select_balanced(view, *arguments, *place, 1.0 / max(selection.count, 1))
-            return selection.count
-        weights = (1.0 / pixel_count, 1.0 / pixel_count)
-        if self.loss_mode == "class_weighted":
-            weights = (0.5 / max(edges, 1), 0.5 / max(pixel_count - edges, 1))
-        selection.count = pixel_count
-        self._select_all(view, images.maps, selection.mask, selection.planes, images.level, *weights)
-        return selection.count
+    def select_pixels(self, views, seeds):
+        """Choose the pixels for the loss in up to `selection.pages` views; view i of them goes to page i.
 
-    def record(self, view, orient_weight=0.0, shape_weight=0.0):
-        """Loss and gradients of the selected pixels, through the tape. Gradients ADD to what is there."""
-        count, images = self.fields.count, self.images
+        views, seeds: (n,) ints, or one of each. Returns how many pixels each has (0: its map has no edge pixel).
+        """
+        images, selection = self.images, self.selection
+        views, seeds = np.atleast_1d(views).astype(np.int32), np.atleast_1d(seeds).astype(np.uint32)
+        pixel_count = images.height * images.width
+        edges = images.edge_counts[views]
+        if self.loss_mode == "balanced":
+            backgrounds = np.minimum(edges, pixel_count - edges)
+            selection.counts[: len(views)] = edges + backgrounds
+        else:
+            backgrounds = np.full(len(views), -1)
+            selection.counts[: len(views)] = pixel_count
+        selection.views[: len(views)] = views
+        arguments = (images.maps, images.words, selection.words)
+        self._select(len(views), views, seeds, backgrounds.astype(np.int32), *arguments)
+        return selection.counts[: len(views)]
+
+    def weights(self, page):
+        """Weights of an edge pixel and of a background pixel of a page in the loss."""
+        pixel_count, edges = (
+            self.images.height * self.images.width,
+            int(self.images.edge_counts[self.selection.views[page]]),
+        )
+        if self.loss_mode == "class_weighted":
+            return 0.5 / max(edges, 1), 0.5 / max(pixel_count - edges, 1)
+        return (1.0 / max(int(self.selection.counts[page]), 1),) * 2
+
+    def draw(self, page=0):
+        """Transmittance at the pixels selected in `page`, and their loss, added to what is there."""
+        level = (self.images.level - 0.5) / 255
+        self._compare(self.fields.count, page, int(self.selection.views[page]), level, *self.weights(page))
+
+    def record(self, page=0, orient_weight=0.0, shape_weight=0.0):
+        """Loss and gradients of the pixels selected in `page`, through the tape. Gradients ADD to what is there."""
         with ti.ad.Tape(loss=self.loss, clear_gradients=False):
-            self._project(count, view, images.width, images.height)
-            self._splat(count)
-            self._image_loss(self.selection.count)
+            self.draw(page)
             if orient_weight or shape_weight:
-                self._copy_neighbors(count)
-                self._regularize(count, orient_weight, shape_weight)
+                self._regularize(self.fields.count, orient_weight, shape_weight)
 
     def update(self, step, means_rate, scales_rate, quaternions_rate, opacities_rate):
         """One Adam step (`step` counts from 1) with these learning rates; zeroes the gradients."""
@@ -128,7 +141,6 @@ class Splatter:
         """(H, W) image C = 1 - T of the Gaussians in one view, every pixel evaluated. Needs a whole-image loss."""
         assert self.loss_mode != "balanced", "only a whole-image selection has every pixel"
         self.select_pixels(view, 0)
-        self._project(self.fields.count, view, self.images.width, self.images.height)
-        self._splat(self.fields.count)
+        self.draw()
         shape = (self.images.height, self.images.width)
-        return 1.0 - self.selection.transmittance.to_numpy()[: self.selection.count].reshape(shape)
+        return 1.0 - self.selection.transmittance.to_numpy()[: shape[0] * shape[1]].reshape(shape)

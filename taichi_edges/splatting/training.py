@@ -14,11 +14,14 @@ from taichi_edges.splatting.gaussians import Gaussians, logit
 from taichi_edges.splatting.splatter import GPU_ARCHS, Splatter
 
 
-@dataclass(frozen=True)
-class EpochRecord:
-    """One line of the training log. seconds: since the start. loss: mean of L_proj over the epoch's views."""
+LOG_STEPS = 50  # view steps between two lines of the training log
 
-    epoch: int
+
+@dataclass(frozen=True)
+class LogRecord:
+    """One line of the training log. seconds: since the start. loss: mean of L_proj over the steps since the last."""
+
+    step: int
     seconds: float
     loss: float
     gaussians: int
@@ -45,11 +48,11 @@ def start_taichi(arch, threads, seed, cache):
         raise UserError(f"--arch {arch}: this machine offers Taichi no {arch} device; use --arch cpu")
 
 
-def rates(config, epoch):
-    """Learning rates (means, scales, quaternions, opacities) of an epoch counted from 0 (supplement, "Training")."""
-    decays = min(epoch // config.means_decay_epochs, config.means_decays)
+def rates(config, share):
+    """Learning rates (means, scales, quaternions, opacities) after a share of the run (supplement, "Training")."""
+    decays = min(int(share / config.means_decay_every + 1e-9), config.means_decays)
     means = config.learning_rates.means * config.means_decay**decays
-    if epoch < config.only_means_epochs:
+    if share < config.only_means:
         return means, 0.0, 0.0, 0.0
     others = config.learning_rates
     return means, others.scales, others.quaternions, others.opacities
@@ -76,7 +79,8 @@ class Training:
 
     def __init__(self, views, config, generator, threads=1, arch="cpu"):
         self.views, self.config, self.generator = views, config, generator
-        self.step = 0
+        self.total = config.steps or config.epochs * len(views)
+        self.actions = self._actions()
         self.neighbors_at = None
         self.splatter = Splatter(
             views.edge_maps,
@@ -91,65 +95,77 @@ class Training:
         )
 
     def run(self, gaussians, progress):
-        """Train `gaussians`. Returns the trained ones and the list of EpochRecords."""
+        """Train `gaussians`. Returns the trained ones and the list of LogRecords."""
         self.splatter.load(gaussians)
-        records, started = [], time.monotonic()
-        with progress.track("train", self.config.epochs) as report:
-            for epoch in range(self.config.epochs):
-                loss = self._epoch(epoch)
-                self._control_density(epoch)
-                count = self.splatter.fields.count
-                records.append(EpochRecord(epoch + 1, time.monotonic() - started, loss, count))
-                report(epoch + 1, f"loss {loss:.4f}, {count} Gaussians")
+        records, losses, started = [], [], time.monotonic()
+        with progress.track("train", self.total) as report:
+            for step, (page, view) in zip(range(1, self.total + 1), self._selected_views(), strict=False):
+                loss = self._step(step, page)
+                if loss is not None:
+                    losses.append(loss)
+                self._control_density(step)
+                if step % LOG_STEPS == 0 or step == self.total:
+                    count, mean = self.splatter.fields.count, float(np.mean(losses)) if losses else float("nan")
+                    records.append(LogRecord(step, time.monotonic() - started, mean, count))
+                    report(step, f"loss {mean:.4f}, {count} Gaussians")
+                    losses = []
         return self.splatter.fields.gaussians(), records
 
-    def _epoch(self, epoch):
-        """One pass over the views in random order. Returns the mean loss."""
-        losses = []
-        learning_rates = rates(self.config, epoch)
-        for view in self.generator.permutation(len(self.views)):
-            seed = int(self.generator.integers(1 << 32))
-            if not self.splatter.select_pixels(int(view), seed):
-                continue
-            weights = self._regularizer_weights(epoch)
-            self.splatter.record(int(view), *weights)
-            if not any(weights):
-                losses.append(self.splatter.loss[None])
-            self.step += 1
-            self.splatter.update(self.step, *learning_rates)
-        return float(np.mean(losses)) if losses else float("nan")
+    def _selected_views(self):
+        """(page, view) without end: pass after pass in random order, their pixels selected some views at a time."""
+        pages = self.splatter.selection.pages
+        with_edges = np.flatnonzero(self.splatter.images.edge_counts)
+        while True:
+            order = self.generator.permutation(with_edges)
+            seeds = self.generator.integers(1 << 32, size=len(order))
+            for first in range(0, len(order), pages):
+                some = slice(first, first + pages)
+                self.splatter.select_pixels(order[some], seeds[some])
+                yield from enumerate(order[some])
 
-    def _regularizer_weights(self, epoch):
+    def _step(self, step, page):
+        """One view step. Returns L_proj, or None where the regularisers are in the loss."""
+        share = (step - 1) / self.total
+        weights = self._regularizer_weights(step, share)
+        self.splatter.record(page, *weights)
+        loss = None if any(weights) else float(self.splatter.loss[None])
+        self.splatter.update(step, *rates(self.config, share))
+        return loss
+
+    def _regularizer_weights(self, step, share):
         """lambda_1 and lambda_2 of eq. 6 in the steps that apply them, (0, 0) in the others."""
         config, count = self.config, self.splatter.fields.count
-        if epoch < config.regularize_from_epoch or self.step % config.regularize_every or count <= config.neighbors:
+        if share < config.regularize_from or step % config.regularize_every or count <= config.neighbors:
             return 0.0, 0.0
-        stale = self.neighbors_at is None or self.step - self.neighbors_at >= config.neighbors_refresh_steps
-        if stale:
+        if self.neighbors_at is None or step - self.neighbors_at >= config.neighbors_refresh_steps:
             self.splatter.neighbors.load(nearest_neighbors(self.splatter.fields.gaussians().means, config.neighbors))
-            self.neighbors_at = self.step
+            self.neighbors_at = step
         return config.orient_weight, config.shape_weight
 
-    def _control_density(self, epoch):
-        """Culling and duplication where the schedule asks for it after this epoch (counted from 1 in the schedule)."""
-        config, done = self.config.density, epoch + 1
-        actions = []
-        if done in config.duplicate_epochs:
-            actions.append(self._duplicate)
-        if done in config.cull_support_epochs:
-            actions.append(self._cull_support)
-        if done in config.cull_opacity_epochs:
-            actions.append(self._cull_opacity)
-        if not actions:
+    def _actions(self):
+        """Step -> what density control does after it."""
+        config, actions = self.config.density, {}
+        for shares, action in (
+            (config.duplicate_at, self._duplicate),
+            (config.cull_support_at, self._cull_support),
+            (config.cull_opacity_at, self._cull_opacity),
+        ):
+            for share in shares:
+                actions.setdefault(max(round(share * self.total), 1), []).append(action)
+        return actions
+
+    def _control_density(self, step):
+        """Culling and duplication where the schedule asks for it after this step."""
+        if step not in self.actions:
             return
         fields = self.splatter.fields
         gradients = fields.positional_gradients.to_numpy()[: fields.count]
         population = Population(fields.gaussians(), *fields.moments(), gradients)
-        for action in actions:
+        for action in self.actions[step]:
             population = action(population)
         if len(population) == 0:
             raise UserError(
-                f"epoch {done}: no Gaussian is left after culling; the edge maps do not agree with the cameras "
+                f"view step {step}: no Gaussian is left after culling; the edge maps do not agree with the cameras "
                 "(check source.axes and the intrinsics), or train.density culls too much"
             )
         self.splatter.load(population.gaussians, (population.first_moments, population.second_moments))
