@@ -129,7 +129,7 @@ def log_ticks(values):
 
 
 def tick_text(value):
-    """0.5, 20, 800, 2k, 1600, 500k."""
-    if value >= 2000 and value % 1000 == 0:
+    """0.5, 20, 800, 1k, 1600, 500k."""
+    if value >= 1000 and value % 1000 == 0:
         return f"{value / 1000:.0f}k"
     return f"{value:.0f}" if value >= 1 else significant(value, 1)

@@ -1,7 +1,9 @@
 """How time and memory grow with Gaussians, views and pixels: `python -m benchmarks.scaling`.
 
 Each axis is varied alone from a base point. Every point is a process of its own, so that its peak memory is its own; a
-process that had to compile kernels is repeated, because a compiler's memory is not what is asked for.
+process that had to compile kernels is repeated, because a compiler's memory is not what is asked for. Processes cannot
+take turns step by step; so beside the time on the clock there is the processor time of all threads, which others on the
+machine hardly lengthen, and exponents are those of the latter.
 """
 
 import argparse
@@ -49,15 +51,17 @@ def measure_here(count, view_count, width, height, threads, repeats):
     built, peaks = memory_mib(), [*peaks, peak_memory_mib()]
     reset_peak_memory()
     splatter.load(scatter_gaussians(scene, count, np.random.default_rng(SEED)))
-    milliseconds = []
+    milliseconds, processor = [], []
     for number in range(1, WARM_UP_STEPS + repeats + 1):
-        started = time.perf_counter()
+        started, used = time.perf_counter(), time.process_time()
         view_step(splatter, number % view_count, number)
         milliseconds.append((time.perf_counter() - started) * 1e3)
+        processor.append((time.process_time() - used) * 1e3)
     peaks.append(peak_memory_mib())
     arrays = array_bytes(splatter.images)
     return {
         "milliseconds": float(np.median(milliseconds[WARM_UP_STEPS:])),
+        "processor": float(np.median(processor[WARM_UP_STEPS:])),
         "begun": begun,  # Python, NumPy, OpenCV and Taichi alone
         "with_maps": with_maps,  # and the maps of the scene
         "built": built,  # and the Splatter
@@ -129,14 +133,15 @@ def slopes(xs, ys):
 def slope_text(xs, ys):
     """'0.98 (0.99 at the end)'."""
     fitted, last = slopes(xs, ys)
-    return "-" if fitted is None else f"{fitted:.2f} ({last:.2f} at the end)"
+    return "-" if fitted is None else f"{round(fitted, 2) + 0.0:.2f} ({round(last, 2) + 0.0:.2f} at the end)"
 
 
 def series(axis, points, found):
-    """{what: (xs, ys)} of one axis: ms per step, peak MiB, MiB of the maps."""
+    """{what: (xs, ys)} of one axis: ms per step on the clock and of all threads, peak MiB, MiB of the maps."""
     xs = tuple(position(axis, point) for point in points)
     return {
-        "time": (xs, tuple(found[point]["milliseconds"] for point in points)),
+        "clock": (xs, tuple(found[point]["milliseconds"] for point in points)),
+        "processor": (xs, tuple(found[point]["processor"] for point in points)),
         "peak": (xs, tuple(found[point]["peak"] for point in points)),
         "maps": (xs, tuple(found[point]["edge_images"] / MIB for point in points)),
     }
@@ -147,8 +152,9 @@ def draw_curves(path, curves, found):
     above, below = [], []
     for axis, points in curves.items():
         of = series(axis, points, found)
-        exponent = f"exponent {slope_text(*of['time'])}"
-        above.append(Panel("milliseconds per view step", AXES[axis], (Curve(exponent, *of["time"]),)))
+        exponent = f"processor: exponent {slope_text(*of['processor'])}"
+        times = Curve(exponent, *of["processor"]), Curve("on the clock", *of["clock"])
+        above.append(Panel("milliseconds per view step", AXES[axis], times))
         memory = Curve("whole process", *of["peak"]), Curve("edge maps in the Splatter", *of["maps"])
         below.append(Panel("peak memory, MiB", AXES[axis], memory))
     draw_panels(path, [above, below])
@@ -162,8 +168,8 @@ def print_points(curves, found):
             of = found[point]
             size = f"{point[2]} x {point[3]}"
             memory = [f"{value:.0f}" for value in (of["peak"], of["host_maps"] / MIB, of["edge_images"] / MIB)]
-            rows.append([point[0], point[1], size, of["milliseconds"], *memory])
-    headings = ["Gaussians", "views", "pixels", "ms per step", "peak MiB"]
+            rows.append([point[0], point[1], size, of["milliseconds"], of["processor"], *memory])
+    headings = ["Gaussians", "views", "pixels", "ms per step", "ms of all threads", "peak MiB"]
     print(table([*headings, "maps in NumPy MiB", "maps in the Splatter MiB"], rows))
 
 
@@ -172,8 +178,8 @@ def print_exponents(curves, found):
     rows = []
     for axis, points in curves.items():
         of = series(axis, points, found)
-        rows.append([axis, *(slope_text(*of[what]) for what in ("time", "peak", "maps"))])
-    print(table(["axis", "time", "peak memory", "maps in the Splatter"], rows))
+        rows.append([axis, *(slope_text(*of[what]) for what in ("processor", "peak", "maps"))])
+    print(table(["axis", "ms of all threads", "peak memory", "maps in the Splatter"], rows))
 
 
 def print_large(point, of):
