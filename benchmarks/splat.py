@@ -26,8 +26,8 @@ TWIN_REPEATS = 3
 class Result:
     """What was measured at one number of Gaussians, milliseconds.
 
-    pixels: selected ones, on average. smallest: transmittance. steps: {part: ms} of each step. floors: (forward, backward) of each
-    pass in C; empty without it. twin: medians (loss, gradient) of the slow twin, scaled up.
+    pixels: selected ones, on average. smallest: transmittance. steps: {part: ms} of each step. floors: (forward,
+    backward) of each pass in C; empty without it. twin: medians (loss, gradient) of the slow twin, scaled up.
     """
 
     count: int
