@@ -1,0 +1,168 @@
+"""Whole runs: seconds, memory and metrics of every scene file, `python -m benchmarks.pipeline --preset fast paper`.
+
+Each run is the command a user types, in a process of its own, from the shell to the written exports.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.machine import available_threads, benchmark_cache, compiled_kernels, machine_line, maxrss_mib
+from benchmarks.markdown import table
+from taichi_edges.errors import UserError
+from taichi_edges.pipeline import STAGES, Run
+from taichi_edges.scene_file import load_scene
+
+ROOT = Path(__file__).parent.parent
+METRICS = {
+    "Acc mm": ("accuracy_mm", "{:.2f}"),
+    "Comp mm": ("completeness_mm", "{:.2f}"),
+    "F5 %": ("f_score_5mm_percent", "{:.1f}"),
+    "F10 %": ("f_score_10mm_percent", "{:.1f}"),
+}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One run.
+
+    wall: seconds of the whole command. stages: {name: (seconds, peak MiB)}. peak: MiB of the process. metrics: as in
+    metrics.json. compiled: how many kernels had to be compiled.
+    """
+
+    wall: float
+    stages: dict
+    peak: float
+    metrics: dict
+    compiled: int
+
+
+def missing_data(scene, data_root):
+    """Why a scene cannot run here, or None."""
+    try:
+        run = Run(load_scene(str(scene), None, [], None), Path("nowhere"), data_root)
+        for stage in STAGES.values():
+            stage.outside(run)
+    except UserError as error:
+        return str(error)
+    return None
+
+
+def run_scene(scene, preset, options, cache):
+    """Run the command once in a new folder; its artefacts are thrown away. cache: XDG_CACHE_HOME. Returns Measured."""
+    known, environment = compiled_kernels(cache), {**os.environ, "XDG_CACHE_HOME": str(cache)}
+    with tempfile.TemporaryDirectory() as out, tempfile.TemporaryFile("w+") as messages:
+        command = [sys.executable, str(ROOT / "run.py"), str(scene), "--out", out, "--quiet"]
+        command += ["--threads", str(options.threads), "--arch", options.arch]
+        command += ["--preset", preset] if preset else []
+        started = time.perf_counter()
+        process = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=messages, env=environment, cwd=ROOT, text=True
+        )
+        _, status, usage = os.wait4(process.pid, 0)
+        wall = time.perf_counter() - started
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            messages.seek(0)
+            raise SystemExit(f"{' '.join(command)}\nended with status {process.returncode}:\n{messages.read()}")
+        (folder,) = Path(out).iterdir()
+        record = json.loads((folder / "run.json").read_text())
+        metrics = json.loads((folder / "metrics.json").read_text())
+    stages = {name: (stage["seconds"], stage["peak_memory_mib"]) for name, stage in record["stages"].items()}
+    # The stages reset the system's record of the peak, so that of the process covers only what comes after the last.
+    peak = max(maxrss_mib(usage), *(peak for _, peak in stages.values()))
+    return Measured(wall, stages, peak, metrics, len(compiled_kernels(cache) - known))
+
+
+def measure(scene, preset, options):
+    """`options.repeats` runs that found their kernels compiled, or with --cold as many that did not."""
+    if options.cold:
+        return [run_cold(scene, preset, options) for _ in range(options.repeats)]
+    first = run_scene(scene, preset, options, benchmark_cache())
+    if first.compiled:
+        print(f"{scene.stem}: {first.compiled} kernels had to be compiled; that run does not count", file=sys.stderr)
+    runs = [] if first.compiled else [first]
+    return runs + [run_scene(scene, preset, options, benchmark_cache()) for _ in range(options.repeats - len(runs))]
+
+
+def run_cold(scene, preset, options):
+    """One run with an empty kernel cache."""
+    with tempfile.TemporaryDirectory() as cache:
+        return run_scene(scene, preset, options, cache)
+
+
+def seconds_row(runs):
+    """Medians: whole command, each stage, what lies outside of them (imports, summary), peak memory."""
+    wall = median([run.wall for run in runs])
+    stages = [median([run.stages[name][0] for run in runs]) for name in STAGES]
+    outside = median([run.wall - sum(seconds for seconds, _ in run.stages.values()) for run in runs])
+    return [wall, *stages, outside, f"{median([run.peak for run in runs]):.0f}"]
+
+
+def memory_row(runs):
+    """Medians of the peak memory of each stage."""
+    return [f"{median([run.stages[name][1] for run in runs]):.0f}" for name in STAGES]
+
+
+def metrics_row(runs):
+    """What the runs found; they are alike, because the seed is."""
+    metrics = runs[0].metrics
+    if metrics["ground_truth"] is None:
+        return [None] * (len(METRICS) + 1)
+    found = [pattern.format(metrics[key]) if metrics[key] is not None else None for key, pattern in METRICS.values()]
+    return [*found, f"{metrics['edges']} ({metrics['true_edges']})"]
+
+
+def median(values):
+    """As a float."""
+    return float(np.median(values))
+
+
+def parse_arguments(arguments=None):
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.pipeline", description=__doc__.splitlines()[0])
+    parser.add_argument("--scene", type=Path, nargs="+", help="scene files (default: all in scenes/)")
+    parser.add_argument("--preset", choices=("fast", "paper"), nargs="+", default=[None], help="default: the scene's")
+    parser.add_argument("--threads", type=int, default=available_threads())
+    parser.add_argument("--arch", choices=("cpu", "cuda", "vulkan"), default="cpu")
+    parser.add_argument("--repeats", type=int, default=1, help="runs of each; medians are printed")
+    parser.add_argument("--cold", action="store_true", help="compile all kernels anew in every run")
+    return parser.parse_args(arguments)
+
+
+def main(arguments=None):
+    """Measure and print. Returns {(scene, preset): runs}."""
+    options = parse_arguments(arguments)
+    data = os.environ.get("TAICHI_EDGES_DATA")
+    scenes = options.scene or sorted((ROOT / "scenes").glob("*.yaml"))
+    skipped = {scene: missing_data(scene, Path(data) if data else None) for scene in scenes}
+    found = {}
+    for scene in (scene for scene in scenes if not skipped[scene]):
+        for preset in options.preset:
+            found[scene.stem, preset or "its own"] = measure(scene.resolve(), preset, options)
+    cache = "empty kernel cache" if options.cold else "kernels compiled before"
+    print(f"{machine_line()}\n{options.arch}, {options.threads} threads, {cache}, medians of {options.repeats} runs")
+    heads = ["scene", "preset"]
+    print("\nSeconds, and peak memory of the process:\n")
+    columns = [*heads, "whole command", *STAGES, "outside stages", "peak MiB"]
+    print(table(columns, [[*key, *seconds_row(runs)] for key, runs in found.items()]))
+    print("\nPeak memory of each stage, MiB:\n")
+    print(table([*heads, *STAGES], [[*key, *memory_row(runs)] for key, runs in found.items()]))
+    print("\nWhat they found:\n")
+    print(table([*heads, *METRICS, "edges (true)"], [[*key, *metrics_row(runs)] for key, runs in found.items()]))
+    for scene, reason in skipped.items():
+        if reason:
+            print(f"\nSkipped {scene.stem}: {reason}")
+    return found
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,184 @@
+"""The benchmarks run to their end at tiny sizes and print plausible rows. How fast anything is, is not tested."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from benchmarks.edge_scene import NOISE_PX, make_scene, scatter_gaussians
+from benchmarks.floor import FloorDiffers, FloorMissing, assert_same, compile_floor
+from benchmarks.log_plot import log_ticks, tick_text
+from benchmarks.markdown import significant, table
+from benchmarks.scaling import slopes
+from benchmarks.view_step import DumpedStep, part_of
+from taichi_edges.cameras import project
+from taichi_edges.splatting.gaussians import Gaussians
+
+ROOT = Path(__file__).parent.parent
+SCENE = """
+source: {reader: synthetic, part: block, views: 6, size: 64}
+train: {epochs: 3, gaussians: 300, seeds: random, only_means_epochs: 1}
+filter: {min_opacity: 0.0, min_support: 0.0}
+cluster: {max_gap: 0.3, min_points: 3, theta: 0.0}
+fit: {line_tolerance: 0.1}
+"""
+
+
+@pytest.fixture(scope="module")
+def run(pytestconfig):
+    """run(module, *arguments) -> what `python -m benchmarks.<module>` prints."""
+    cache = pytestconfig.cache.mkdir("benchmarks")
+
+    def run_one(module, *arguments):
+        command = [sys.executable, "-m", f"benchmarks.{module}", *map(str, arguments)]
+        environment = {**os.environ, "XDG_CACHE_HOME": str(cache)}
+        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=300)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run_one
+
+
+def read_tables(text):
+    """The Markdown tables in a text, each a list of {heading: cell}."""
+    tables, headings = [], None
+    for line in text.splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")] if line.startswith("|") else None
+        if cells is None:
+            headings = None
+        elif headings is None:
+            headings = cells
+            tables.append([])
+        elif not line.startswith("|-"):
+            tables[-1].append(dict(zip(headings, cells, strict=True)))
+    return tables
+
+
+# The scripts --------------------------------------------------------------------------------------------------------
+
+
+def test_splat_prints_parts_and_ratios(run):
+    text = run("splat", "--sizes", 300, 500, "--size", 200, "--repeats", 2, "--threads", 2)
+    assert "Taichi" in text.splitlines()[0]
+    steps, ratios = read_tables(text)
+    assert [row["Gaussians"] for row in steps] == [row["Gaussians"] for row in ratios] == ["300", "500"]
+    for row in steps:
+        assert int(row["pixels"]) > 100
+        assert all(float(row[part]) > 0 for part in ("project", "forward", "backward", "project'", "Adam", "step"))
+    for row in ratios:
+        assert float(row["twin / loss"]) > 1 and float(row["twin / gradient"]) > 1
+        if "No C floor" in text:
+            assert row["forward / C"] == "-"
+        else:
+            assert float(row["forward / C"]) > 0 and float(row["backward / C"]) > 0
+
+
+def test_pipeline_prints_stages_and_metrics(run, tmp_path):
+    scene, lost = tmp_path / "tiny.yaml", tmp_path / "lost.yaml"
+    scene.write_text(SCENE)
+    lost.write_text("source: {path: /nowhere/at/all}\n")
+    text = run("pipeline", "--scene", scene, lost, "--threads", 2)
+    seconds, memory, found = read_tables(text)
+    assert seconds[0]["scene"] == memory[0]["scene"] == found[0]["scene"] == "tiny" and len(seconds) == 1
+    stages = ("prepare", "train", "cluster", "fit", "evaluate", "export")
+    assert float(seconds[0]["whole command"]) > sum(float(seconds[0][stage]) for stage in stages) > 0
+    assert float(seconds[0]["peak MiB"]) >= max(float(memory[0][stage]) for stage in stages) > 50
+    assert found[0]["edges (true)"].endswith("(12)")
+    assert "Skipped lost: source.path: /nowhere/at/all does not exist" in text
+
+
+def test_scaling_prints_points_and_draws(run, tmp_path):
+    picture = tmp_path / "curves.png"
+    base = ("--base", 300, 4, 96, "--large", 4, 96, 96, "--repeats", 1, "--threads", 2, "--out", picture)
+    text = run("scaling", "--gaussians", 300, 600, "--views", 4, "--sizes", 96, *base)
+    points, exponents, arrays, moments = read_tables(text)
+    assert [row["Gaussians"] for row in points] == ["300", "600", "300", "300"]
+    assert all(
+        min(float(row["ms per step"]), float(row["ms of all threads"])) > 0 and float(row["peak MiB"]) > 50
+        for row in points
+    )
+    assert exponents[0]["ms of all threads"].endswith("at the end)") and exponents[1]["ms of all threads"] == "-"
+    assert {"maps": str(4 * 96 * 96)}.items() <= {row["array"]: row["bytes"] for row in arrays}.items()
+    assert "The Splatter's arrays fit in 1 GiB" in text and len(moments) == 5
+    assert cv2.imread(str(picture)).std() > 5
+
+
+# Their rooms --------------------------------------------------------------------------------------------------------
+
+
+def test_scene_has_gaussians_around_its_edges(generator):
+    scene = make_scene(3, 120, 80)
+    assert scene.edge_maps.shape == (3, 80, 120) and (scene.edge_maps > 0).sum(axis=(1, 2)).min() > 50
+    gaussians = scatter_gaussians(scene, 2000, generator)
+    away = cv2.distanceTransform((scene.edge_maps[0] == 0).astype(np.uint8), cv2.DIST_L2, 5)
+    columns, rows = np.rint(project(gaussians.means, scene.intrinsics[0], scene.world_to_camera[0])[0]).astype(int).T
+    inside = (columns >= 0) & (columns < 120) & (rows >= 0) & (rows < 80)
+    assert inside.mean() > 0.95 and np.median(away[rows[inside], columns[inside]]) < 2 * NOISE_PX
+
+
+def test_floor_that_differs_is_refused(generator):
+    count, slots = 50, 400
+    gradients, slopes_of_splats, pull = (
+        generator.normal(size=(count, 6)),
+        generator.normal(size=(count, 6)),
+        np.ones(50),
+    )
+    direction = Gaussians(*(np.ones(shape) for shape in ((count, 3), (count, 3), (count, 4), (count,))))
+    slope = (gradients * slopes_of_splats).sum(axis=1)
+    taichi_gradients = Gaussians(np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 4)), slope)
+    transmittance = generator.random(slots)
+    unused = dict.fromkeys(("shape", "splats", "boxes", "pixels", "d_transmittance"))
+    step = DumpedStep(**unused, transmittance=transmittance, gradients=taichi_gradients, pull=pull)
+    assert_same(step, transmittance, gradients, pull, slopes_of_splats, direction)
+    with pytest.raises(FloorDiffers, match="transmittance: .* differ"):
+        assert_same(step, transmittance * 0.99, gradients, pull, slopes_of_splats, direction)
+    with pytest.raises(FloorDiffers, match="gradient: off by"):
+        assert_same(step, transmittance, gradients * [1, 1, 1, 1, 1, 1.1], pull, slopes_of_splats, direction)
+    with pytest.raises(FloorDiffers, match="positional"):
+        assert_same(step, transmittance, gradients, pull * 1.01, slopes_of_splats, direction)
+    with pytest.raises(FloorDiffers, match="transmittance"):
+        assert_same(step, transmittance * np.nan, gradients, pull, slopes_of_splats, direction)
+
+
+def test_missing_compiler_is_named(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(FloorMissing, match="there is no gcc"):
+        compile_floor()
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="there is no gcc")
+def test_floor_compiles():
+    assert compile_floor().forward
+
+
+def test_kernels_belong_to_parts():
+    assert part_of("project_c86_0_kernel_1_range_for") == "project"
+    assert part_of("project_c87_0_reverse_grad_kernel_1_range_for") == "project'"
+    assert part_of("draw_product_c88_0_kernel_0_range_for") == "forward"
+    assert part_of("image_loss_c85_0_reverse_grad_kernel_1_range_for") == "loss'"
+    assert part_of("something_new_c3_0_kernel_0_serial") == "something_new"
+
+
+def test_numbers_and_tables_read_well():
+    numbers = (0.0, 12345.6, 123.4, 1.234, 0.01234, 9.996, float("nan"))
+    assert [significant(x) for x in numbers] == ["0", "12346", "123", "1.23", "0.0123", "10.0", "-"]
+    assert table(["a", "bb"], [[1, None]]) == "| a | bb |\n|---|----|\n| 1 | -  |"
+
+
+def test_ticks_enclose_the_values():
+    assert log_ticks([13.0, 13.1]) == [10, 20]
+    assert log_ticks([3.0, 180.0]) == [2, 5, 10, 20, 50, 100, 200]
+    assert log_ticks([2.0, 50_000.0]) == [1, 10, 100, 1000, 10_000, 100_000]
+    assert [tick_text(x) for x in (0.5, 20, 1000, 1600, 500_000)] == ["0.5", "20", "1k", "1600", "500k"]
+
+
+def test_slopes_are_exponents():
+    xs = [1.0, 2.0, 4.0, 16.0]
+    np.testing.assert_allclose(slopes(xs, [3 * x**1.5 for x in xs]), 1.5)
+    np.testing.assert_allclose(slopes(xs, [1, 1, 1, 4])[1], 1.0)
+    assert slopes([5.0], [1.0]) == (None, None)
