@@ -70,9 +70,9 @@ class TrainConfig(Section):
     """
 
     epochs: Annotated[int, Field(ge=0)] = Field(500, description="passes over all views; 0: train.steps counts")
-    steps: Annotated[int, Field(ge=0)] = Field(0, description="view steps; 0: train.epochs counts")
+    steps: Annotated[int, Field(ge=0)] = Field(0, description="view steps, at least one pass; 0: train.epochs counts")
     settled: Share = Field(
-        0.0, description="stop when a pass over the views lowers the loss by no more than this share; 0: never"
+        0.0, description="after the last cull, stop when a pass lowers the loss by no more than this share; 0: never"
     )
     gaussians: Count = Field(10_000, description="number of random points to start from")
     seeds: Literal["random", "points", "votes"] = Field(
@@ -198,8 +198,8 @@ PRESETS = {
     "fast": {
         "train": {
             "epochs": 0,
-            "steps": 1000,
-            "settled": 0.0,
+            "steps": 500,
+            "settled": 0.01,
             "gaussians": 10_000,
             "seeds": "votes",
             "initial_opacity": 0.3,

@@ -177,7 +177,9 @@ def selected(splatter, page=0):
     rows, columns = np.nonzero(chosen)
     np.testing.assert_array_equal(selection.columns.to_numpy()[page, :count], columns)
     targets = selection.targets.to_numpy()[page, :count]
-    edges = splatter.images.maps.to_numpy()[selection.views[page], rows, columns] >= splatter.images.level
+    maps = splatter.images.maps
+    maps = maps if isinstance(maps, np.ndarray) else maps.to_numpy()
+    edges = maps[selection.views[page], rows, columns] >= splatter.images.level
     return np.stack([columns, rows], axis=1), np.where(edges, *splatter.weights(page)), targets
 
 

@@ -138,18 +138,18 @@ def test_views_do_not_leave_traces_in_each_other(open_splatter, seed, generator)
 
 
 def test_mask_packs_bit_b_of_word_w_as_column_32_w_plus_b(generator):
-    edges = generator.random((2, 3, 71)) < 0.5
+    edges = generator.random((3, 71)) < 0.5
     words = pack_mask(edges)
-    assert words.shape == (2, 3, 3) and words.dtype == np.uint32
+    assert words.shape == (3, 3) and words.dtype == np.uint32
     columns = np.arange(96)
-    unpacked = (words[:, :, columns // 32] >> (columns % 32).astype(np.uint32)) & 1
-    np.testing.assert_array_equal(unpacked[:, :, :71], edges)
-    assert not unpacked[:, :, 71:].any()
+    unpacked = (words[:, columns // 32] >> (columns % 32).astype(np.uint32)) & 1
+    np.testing.assert_array_equal(unpacked[:, :71], edges)
+    assert not unpacked[:, 71:].any()
 
 
 def assert_words(words, chosen):
     """The masks are those of `chosen` (H, W), and with each stands the number of chosen pixels before its word."""
-    np.testing.assert_array_equal(words[:, :, 0], pack_mask(chosen[None])[0])
+    np.testing.assert_array_equal(words[:, :, 0], pack_mask(chosen))
     sizes = [row[first : first + 32].sum() for row in chosen for first in range(0, chosen.shape[1], 32)]
     np.testing.assert_array_equal(words[:, :, 1].ravel(), np.concatenate([[0], np.cumsum(sizes)[:-1]]))
 

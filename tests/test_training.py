@@ -9,7 +9,7 @@ from taichi_edges.scene import DensityConfig, TrainConfig
 from taichi_edges.splatting.density import Population, cull_opacity, cull_support, duplicate
 from taichi_edges.splatting.gaussians import Gaussians, logit, start_gaussians
 from taichi_edges.splatting.seeding import random_points
-from taichi_edges.splatting.training import Training, nearest_neighbors, rates
+from taichi_edges.splatting.training import Settling, Training, nearest_neighbors, rates
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import Imperfections, render_views
 from taichi_edges.synthetic.visibility import sample_edges
@@ -170,6 +170,36 @@ def test_the_last_neighbour_repeats_where_there_are_too_few(generator, count):
 def test_learning_rates_are_the_supplements(epoch, means):
     others = (2e-4, 1e-3, 3e-2) if epoch >= 30 else (0.0, 0.0, 0.0)  # positions only for 30 epochs
     assert rates(TrainConfig(), epoch / 500) == pytest.approx((means, *others))
+
+
+def test_the_loss_has_settled_when_two_passes_hardly_lower_it():
+    settling = Settling(3)
+    for falling in (1.0, 0.8, 0.64):
+        for view, level in enumerate((1.0, 5.0, 2.0)):  # each view is compared with itself
+            assert settling.drop() == np.inf
+            settling.add(view, level * falling)
+    assert settling.drop() == pytest.approx(0.2)
+    for falling in (0.64, 0.64):
+        for view, level in enumerate((1.0, 5.0, 2.0)):
+            settling.add(view, level * falling)
+    assert settling.drop() == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("settled, end", [(1.0, 60 + 3 * 12), (0.0, 240)])
+def test_a_run_ends_early_only_when_nothing_more_is_scheduled(start_taichi, block, settled, end):
+    density = DensityConfig(duplicate_at=[], cull_opacity_at=[0.25], cull_support_at=[], min_opacity=0.0)
+    config = TrainConfig(epochs=0, steps=240, gaussians=300, regularize_from=1.0, density=density)
+    config = config.model_copy(update={"settled": settled})
+    _, _, records = train(start_taichi, block, config)
+    # The cull after step 60 starts the comparison anew: the views' losses once more, then two passes.
+    assert records[-1].step == end
+
+
+@pytest.mark.parametrize("steps, total", [(5, 12), (30, 30)])
+def test_every_view_is_seen_at_least_once(start_taichi, block, steps, total):
+    config = TrainConfig(epochs=0, steps=steps, gaussians=300, density=DensityConfig(duplicate_at=[]))
+    _, _, records = train(start_taichi, block, config)
+    assert records[-1].step == total
 
 
 # End to end -----------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ LOG2_E = 1.4426950408889634
 
 @ti.func
 def fast_exp2(x):
-    """2^x in f32, x brought into -120..120: minimax polynomial, off by 1e-7; with libm's exp a splat takes twice as long."""
+    """2^x in f32, x brought into -120..120: minimax polynomial, off by 1e-7; libm's exp costs twice the splat."""
     bounded = ti.min(ti.max(x, -120.0), 120.0)
     whole = ti.floor(bounded + 0.5)
     f = bounded - whole

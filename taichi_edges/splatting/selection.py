@@ -13,12 +13,12 @@ BLOCK = 512  # Taichi's CPU backend gives a thread no fewer items of a range-for
 
 
 def pack_mask(edges):
-    """(V, H, W) bool -> (V, H, ceil(W / 32)) uint32, bit b of word w is column 32 w + b."""
-    count, height, width = edges.shape
-    words = -(-width // WORD)
-    padded = np.zeros((count, height, words * WORD), bool)
-    padded[:, :, :width] = edges
-    return np.packbits(padded, axis=2, bitorder="little").view("<u4")
+    """(H, W) bool -> (H, ceil(W / 32)) uint32, bit b of word w is column 32 w + b."""
+    height, width = edges.shape
+    packed = np.packbits(edges, axis=1, bitorder="little")
+    padded = np.zeros((height, -(-width // WORD) * 4), np.uint8)
+    padded[:, : packed.shape[1]] = packed
+    return padded.view("<u4")
 
 
 class PixelSelection:

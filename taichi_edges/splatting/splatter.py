@@ -7,7 +7,7 @@ from taichi_edges.splatting.gaussians import GaussianFields, round_capacity
 from taichi_edges.splatting.losses import NeighborFields, make_regularizers
 from taichi_edges.splatting.optimizer import BETA1, BETA2, make_adam
 from taichi_edges.splatting.projection import CameraFields, SplatFields
-from taichi_edges.splatting.selection import PixelSelection, make_select, pack_mask
+from taichi_edges.splatting.selection import WORD, PixelSelection, make_select, pack_mask
 from taichi_edges.splatting.splat import make_compare
 
 LOSSES = ("balanced", "class_weighted", "whole_image")  # eq. 3 first; the other two are the options the paper names
@@ -16,25 +16,30 @@ PAGES = 16  # views whose pixels are selected in one launch
 
 
 class EdgeImages:
-    """The edge maps on the device: u8 maps, bit masks and lists of their edge pixels."""
+    """The edge maps as the kernels read them: u8 maps and bit masks of their edge pixels.
 
-    def __init__(self, edge_maps, threshold):
+    On a CPU the kernels read the given maps where they are: a copy would double the largest thing in memory.
+    """
+
+    def __init__(self, edge_maps, threshold, on_gpu=False):
         """edge_maps: (V, H, W) uint8. threshold: of full scale; from here on a pixel is an edge pixel."""
         count, self.height, self.width = edge_maps.shape
         self.level = int(np.ceil(threshold * 255))
-        edges = edge_maps >= self.level
-        self.edge_counts = edges.reshape(count, -1).sum(axis=1).astype(np.int64)
-        self.starts = np.concatenate([[0], np.cumsum(self.edge_counts)])
-        pixels = np.concatenate([np.flatnonzero(edge) for edge in edges.reshape(count, -1)])
-        self.maps = _to_device(edge_maps, ti.u8)
-        self.words = _to_device(pack_mask(edges), ti.u32)
-        self.pixels = _to_device(pixels if len(pixels) else np.zeros(1), ti.i32)
+        self.edge_counts = np.zeros(count, np.int64)
+        words = np.zeros((count, self.height, -(-self.width // WORD)), np.uint32)
+        for view, edge_map in enumerate(edge_maps):
+            edges = edge_map >= self.level
+            self.edge_counts[view] = np.count_nonzero(edges)
+            words[view] = pack_mask(edges)
+        self.maps = np.ascontiguousarray(edge_maps)
+        self.words = words
+        if on_gpu:
+            self.maps, self.words = _to_device(self.maps, ti.u8), _to_device(words, ti.u32)
 
 
 def _to_device(array, dtype):
     device = ti.ndarray(dtype, shape=array.shape)
-    numpy_types = {ti.u8: np.uint8, ti.u32: np.uint32, ti.i32: np.int32}
-    device.from_numpy(np.ascontiguousarray(array, dtype=numpy_types[dtype]))
+    device.from_numpy(array)
     return device
 
 
@@ -60,7 +65,7 @@ class Splatter:
     ):
         assert loss in LOSSES, loss
         self.loss_mode, self.threads, self.schedule, self.real = loss, threads, schedule, real
-        self.images = EdgeImages(edge_maps, edge_threshold)
+        self.images = EdgeImages(edge_maps, edge_threshold, on_gpu=schedule == "log")
         self.cameras = CameraFields(np.asarray(intrinsics), np.asarray(world_to_camera), real)
         height, width = self.images.height, self.images.width
         balanced = loss == "balanced"

@@ -2,6 +2,7 @@
 
 import gc
 import time
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ from taichi_edges.splatting.density import Population
 from taichi_edges.splatting.gaussians import Gaussians, logit
 from taichi_edges.splatting.splatter import GPU_ARCHS, Splatter
 
-
+SETTLED_PASSES = 2  # over the views; the pixels drawn anew make the loss of a single pass uncertain by 0.7 %
 LOG_STEPS = 50  # view steps between two lines of the training log
 
 
@@ -74,12 +75,35 @@ def nearest_neighbors(points, k):
     return others if others.shape[1] == k else np.pad(others, ((0, 0), (0, k - others.shape[1])), mode="edge")
 
 
+class Settling:
+    """How much the loss still falls: what each view has now against what it had one pass before."""
+
+    def __init__(self, views):
+        self.last = np.full(views, np.nan)
+        self.before, self.now = deque(maxlen=SETTLED_PASSES * views), deque(maxlen=SETTLED_PASSES * views)
+
+    def add(self, view, loss):
+        """The loss that a view has now."""
+        if np.isfinite(self.last[view]):
+            self.before.append(self.last[view])
+            self.now.append(loss)
+        self.last[view] = loss
+
+    def drop(self):
+        """Share by which a pass has lowered the loss, over the last SETTLED_PASSES; infinite before there are any."""
+        if len(self.now) < self.now.maxlen:
+            return np.inf
+        return 1.0 - sum(self.now) / sum(self.before)
+
+
 class Training:
     """The state of one training run. `config` is the scene's `train` section."""
 
     def __init__(self, views, config, generator, threads=1, arch="cpu"):
         self.views, self.config, self.generator = views, config, generator
-        self.total = config.steps or config.epochs * len(views)
+        # A length in steps is enough for a few hundred views; of more, every one is seen once.
+        self.total = max(config.steps, len(views)) if config.steps else config.epochs * len(views)
+        self.settling = Settling(len(views))
         self.actions = self._actions()
         self.neighbors_at = None
         self.splatter = Splatter(
@@ -103,13 +127,21 @@ class Training:
                 loss = self._step(step, page)
                 if loss is not None:
                     losses.append(loss)
+                    self.settling.add(view, loss)
                 self._control_density(step)
-                if step % LOG_STEPS == 0 or step == self.total:
+                settled = self._has_settled(step)
+                if step % LOG_STEPS == 0 or step == self.total or settled:
                     count, mean = self.splatter.fields.count, float(np.mean(losses)) if losses else float("nan")
                     records.append(LogRecord(step, time.monotonic() - started, mean, count))
                     report(step, f"loss {mean:.4f}, {count} Gaussians")
                     losses = []
+                if settled:
+                    break
         return self.splatter.fields.gaussians(), records
+
+    def _has_settled(self, step):
+        """Whether the run may end here: nothing more is scheduled, and the loss hardly falls."""
+        return step >= max(self.actions, default=0) and 0 < self.config.settled >= self.settling.drop()
 
     def _selected_views(self):
         """(page, view) without end: pass after pass in random order, their pixels selected some views at a time."""
@@ -170,6 +202,7 @@ class Training:
             )
         self.splatter.load(population.gaussians, (population.first_moments, population.second_moments))
         self.neighbors_at = None
+        self.settling = Settling(len(self.views))  # a cull makes the loss jump
 
     def _duplicate(self, population):
         config = self.config.density
