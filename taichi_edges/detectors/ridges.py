@@ -16,6 +16,7 @@ DRAWN_SIGMA = 1.0  # px; about what DexiNed draws (FWHM 2.4 px), wide enough to 
 MIN_CURVATURE = 0.1  # of that of a line as narrow as the scale; on a flank rounding alone leaves a faint curvature
 MIN_PIXELS = 6  # a ridge of fewer is no line
 PATCH = 3  # px; half size of the patch in which a ridge point is drawn
+DRAWN_AT_ONCE = 256  # points; few enough that their patches stay in the cache and in memory that is there already
 
 
 def _reach(sigma):
@@ -24,7 +25,10 @@ def _reach(sigma):
 
 
 def gaussian_derivatives(image, sigma):
-    """First and second derivatives (gx, gy, gxx, gxy, gyy) of an (H, W) float32 image smoothed by `sigma` pixels."""
+    """First and second derivatives of an (H, W) float32 image smoothed by `sigma` pixels: gx, gy, gxx, gxy, gyy.
+
+    They come one after the other, so that whoever wants them at a few pixels does not hold five images.
+    """
     x = np.arange(-_reach(sigma), _reach(sigma) + 1, dtype=np.float64)
     smooth = np.exp(-0.5 * (x / sigma) ** 2)
     smooth /= smooth.sum()
@@ -35,7 +39,8 @@ def gaussian_derivatives(image, sigma):
     second -= second.mean()
     second /= (second * x**2 / 2).sum()
     pairs = ((first, smooth), (smooth, first), (second, smooth), (first, first), (smooth, second))
-    return [cv2.sepFilter2D(image, cv2.CV_32F, along, down, borderType=cv2.BORDER_REPLICATE) for along, down in pairs]
+    for along, down in pairs:
+        yield cv2.sepFilter2D(image, cv2.CV_32F, along, down, borderType=cv2.BORDER_REPLICATE)
 
 
 def ridge_points(edge_map, sigma, threshold):
@@ -45,7 +50,8 @@ def ridge_points(edge_map, sigma, threshold):
     Returns points (n, 2) as (u, v), pixel centres at integers; unit normals (n, 2) across the line; values (n,) 0..1.
     """
     top, left, edge_map = _window(edge_map, threshold, _reach(sigma))
-    image = edge_map.astype(np.float32) / 255.0
+    image = edge_map.astype(np.float32)
+    image /= 255.0
     bright = image >= threshold
     rows, columns = np.nonzero(bright)  # a few percent of the pixels: what follows is computed for them alone
     gx, gy, gxx, gxy, gyy = (derivative[rows, columns] for derivative in gaussian_derivatives(image, sigma))
@@ -84,6 +90,15 @@ def _without_specks(mask, rows, columns):
 def draw_ridges(points, normals, values, height, width, sigma=DRAWN_SIGMA):
     """(H, W) uint8 map of lines through the points: a Gaussian profile of `sigma` pixels across each, `value` high."""
     image = np.zeros((height + 2 * PATCH, width + 2 * PATCH), np.float32)
+    for start in range(0, len(points), DRAWN_AT_ONCE):
+        part = slice(start, start + DRAWN_AT_ONCE)
+        _draw_patches(image, points[part], normals[part], values[part], sigma)
+    image *= 255
+    return np.rint(image, out=image)[PATCH:-PATCH, PATCH:-PATCH].astype(np.uint8)
+
+
+def _draw_patches(image, points, normals, values, sigma):
+    """Draw some of the ridge points into `image`, which is PATCH pixels larger on every side."""
     centres = np.rint(points)
     patch = np.arange(2 * PATCH + 1)  # pixels of `image`, and offsets from the point: (n, 1, 7) right, (n, 7, 1) down
     right = (centres - points)[:, 0, None, None] + (patch - PATCH)
@@ -96,7 +111,6 @@ def draw_ridges(points, normals, values, height, width, sigma=DRAWN_SIGMA):
     columns, rows = centres.astype(np.int64).T[:, :, None, None]
     places = (rows + patch[:, None]) * image.shape[1] + columns + patch
     np.maximum.at(image.reshape(-1), places.ravel(), heights.ravel())  # fast in one dimension and one type only
-    return np.rint(image[PATCH:-PATCH, PATCH:-PATCH] * 255).astype(np.uint8)
 
 
 def thin_edge_maps(edge_maps, width_px, threshold, threads=None):
