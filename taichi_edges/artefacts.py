@@ -55,7 +55,7 @@ def write_json(path, content):
 
 
 def file_state(path):
-    """What tells a file from the one that was there before, without reading it: for what is kept of it."""
+    """What changes when a file is written anew, found without reading it: the key of what is remembered about it."""
     status = os.stat(path)
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 

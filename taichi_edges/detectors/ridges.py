@@ -72,7 +72,7 @@ def ridge_points(edge_map, sigma, threshold):
 
 def _window(edge_map, threshold, margin):
     """Top row, left column and pixels of the part of a map that holds all its bright pixels, `margin` around them."""
-    bright = (np.arange(256, dtype=np.float32) / 255.0 >= threshold)[edge_map]
+    bright = edge_map >= np.count_nonzero(np.arange(256, dtype=np.float32) / 255.0 < threshold)
     spans = []
     for axis, size in ((1, edge_map.shape[0]), (0, edge_map.shape[1])):
         found = np.flatnonzero(bright.any(axis=axis))
