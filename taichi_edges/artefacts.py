@@ -1,6 +1,7 @@
 """Files are written under a temporary name and renamed, so a killed run never leaves half a file under a final name."""
 
 import contextlib
+import functools
 import hashlib
 import json
 import os
@@ -53,8 +54,19 @@ def write_json(path, content):
     return write_text(path, json.dumps(content, indent=1) + "\n")
 
 
+def file_state(path):
+    """What changes when a file is written anew, found without reading it: the key of what is remembered about it."""
+    status = os.stat(path)
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
 def digest_file(path):
-    """A short hash of a file's bytes."""
+    """A short hash of a file's bytes; a file that several stages read is hashed once."""
+    return _digest_of(os.fspath(path), file_state(path))
+
+
+@functools.lru_cache(maxsize=1 << 14)
+def _digest_of(path, _state):
     hasher = hashlib.blake2b(digest_size=16)
     with open(path, "rb") as file:
         while block := file.read(1 << 20):

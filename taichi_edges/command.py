@@ -1,6 +1,7 @@
 """What `run.py` does with its options: load the scene, run the corridor, print the summary, show the window."""
 
 import os
+import sys
 from pathlib import Path
 
 from taichi_edges.errors import UserError
@@ -76,22 +77,21 @@ def print_summary(run, record, until=None):
 
 
 def _print_table(title, headings, rows):
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(highlight=False)
-    if not console.is_terminal:
+    if not sys.stdout.isatty():
         print(title)
         widths = [max(len(row[column]) for row in rows) for column in range(len(headings))] if rows else []
         for row in rows:
             print("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
         return
+    from rich.console import Console
+    from rich.table import Table
+
     table = Table(title=title, title_justify="left")
     for column, heading in enumerate(headings):
         table.add_column(heading, justify="right" if column else "left")
     for row in rows:
         table.add_row(*row)
-    console.print(table)
+    Console(highlight=False).print(table)
 
 
 def show(run):

@@ -7,6 +7,7 @@ user wants to start after is refused when it is missing or stale.
 
 import contextlib
 import errno
+import functools
 import os
 import platform
 import resource
@@ -170,6 +171,7 @@ def _open_record(run):
     }
 
 
+@functools.cache
 def _versions():
     found = {"taichi_edges": taichi_edges.__version__}
     for package in PACKAGES:

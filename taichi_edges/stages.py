@@ -2,7 +2,8 @@
 
 A stage is a plain function of a Run that returns the facts it found (JSON-able), which `run.json` keeps; the fact
 "files", where there is one, lists what it wrote beyond its artefacts. A stage reads only what is on disk, so a resumed
-run cannot differ from an unbroken one.
+run cannot differ from an unbroken one. What takes long to import (SciPy, OpenCV, Open3D, Taichi) is imported by the
+stage that needs it: a run that is up to date, and a mistake in the scene file, shall not wait for it.
 """
 
 import contextlib
@@ -18,13 +19,7 @@ import numpy as np
 from taichi_edges.artefacts import replacing, write_json, write_text
 from taichi_edges.cameras import transform
 from taichi_edges.edge_set import read_edges, write_edges
-from taichi_edges.edges.branches import separate_branches
-from taichi_edges.edges.clustering import grow_clusters
-from taichi_edges.edges.filtering import filter_points
-from taichi_edges.edges.fitting import fit_clusters
-from taichi_edges.edges.segmentation import split_clusters
 from taichi_edges.errors import UserError, did_you_mean
-from taichi_edges.support import line_width
 from taichi_edges.views import read_views, write_views
 
 
@@ -37,8 +32,9 @@ def prepare(run):
     from taichi_edges.readers.frames import build_views
 
     folder = run.data_path(source.path, "source.path")
-    views = build_views(READERS[source.reader](folder, source), source, run.config.box, run.progress)
-    views, facts = _with_thin_lines(views, source, run.config.train.edge_threshold)
+    frames = READERS[source.reader](folder, source)
+    views = build_views(frames, source, run.config.box, run.progress, run.threads)
+    views, facts = _with_thin_lines(views, source, run.config.train.edge_threshold, run.threads)
     write_views(run.path("views.npz"), views)
     size = {"width_px": views.width, "height_px": views.height}
     return {"views": len(views), **size, **facts, "files": _copy_points(run)}
@@ -57,13 +53,14 @@ def _copy_points(run):
     return ["seeds.ply"]
 
 
-def _with_thin_lines(views, source, edge_threshold):
+def _with_thin_lines(views, source, edge_threshold, threads):
     """The views with their edge maps thinned, if the scene wants that, and the width the lines had before."""
     from taichi_edges.detectors.ridges import thin_edge_maps
+    from taichi_edges.support import line_width
 
     width, _ = line_width(views, edge_threshold)
     if source.thin:
-        views = replace(views, edge_maps=thin_edge_maps(views.edge_maps, width, source.thin_threshold))
+        views = replace(views, edge_maps=thin_edge_maps(views.edge_maps, width, source.thin_threshold, threads))
     return views, {"line_width_px": round(width, 2)}
 
 
@@ -88,7 +85,7 @@ def _prepare_synthetic(run):
     for file, picture in zip(files, pictures, strict=True):
         with replacing(run.path(file)) as unfinished:
             unfinished.write_bytes(cv2.imencode(".png", picture[:, :, ::-1])[1])
-    views, facts = _with_thin_lines(views, source, run.config.train.edge_threshold)
+    views, facts = _with_thin_lines(views, source, run.config.train.edge_threshold, run.threads)
     views = replace(views, image_paths=tuple(files))
     write_edges(run.path("truth.json"), part.edges, {"part": part.name})
     write_views(run.path("views.npz"), views)
@@ -162,6 +159,10 @@ def _write_csv(path, rows):
 
 def cluster(run):
     """`gaussians.ply`, `views.npz` -> `points.ply` (filtered oriented points, input frame) and `clusters.npz`."""
+    from taichi_edges.edges.branches import separate_branches
+    from taichi_edges.edges.clustering import grow_clusters
+    from taichi_edges.edges.filtering import filter_points
+    from taichi_edges.edges.segmentation import split_clusters
     from taichi_edges.exporters.point_cloud import write_oriented_points
     from taichi_edges.exporters.splats import read_gaussians
     from taichi_edges.splatting.gaussians import Gaussians
@@ -194,6 +195,8 @@ def _in_words(counts):
 
 def fit(run):
     """`clusters.npz` -> `edges.json` (input frame)."""
+    from taichi_edges.edges.fitting import fit_clusters
+
     views = read_views(run.path("views.npz"))
     with np.load(run.path("clusters.npz")) as archive:
         edges, counts = fit_clusters(archive["points"], archive["labels"], run.config.fit)

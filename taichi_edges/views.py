@@ -1,10 +1,12 @@
 """Views: everything the later stages know about the input. Written by the prepare stage as `views.npz`."""
 
+import functools
+import os
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from taichi_edges.artefacts import replacing
+from taichi_edges.artefacts import file_state, replacing
 from taichi_edges.cameras import Similarity, project
 
 
@@ -74,9 +76,14 @@ def write_views(path, views):
 
 
 def read_views(path):
-    """Read `views.npz`."""
+    """Read `views.npz`. Every stage does: as long as the file stays the same, they share the arrays, read-only."""
+    return _views_of(os.fspath(path), file_state(path))
+
+
+@functools.lru_cache(maxsize=1)
+def _views_of(path, _state):
     with np.load(path) as archive:
-        return Views(
+        views = Views(
             names=tuple(str(name) for name in archive["names"]),
             edge_maps=archive["edge_maps"],
             intrinsics=archive["intrinsics"],
@@ -86,3 +93,6 @@ def read_views(path):
             box=archive["box"],
             input_to_truth=archive["input_to_truth"],
         )
+    for array in (views.edge_maps, views.intrinsics, views.world_to_camera, views.box, views.input_to_truth):
+        array.setflags(write=False)
+    return views

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from taichi_edges.detectors.ridges import DRAWN_SIGMA, draw_ridges, gaussian_derivatives, ridge_points, thin_edge_maps
+from taichi_edges.detectors.ridges import (
+    DRAWN_SIGMA,
+    PATCH,
+    draw_ridges,
+    gaussian_derivatives,
+    ridge_points,
+    thin_edge_maps,
+)
 from taichi_edges.support import line_width
 from taichi_edges.views import Views
 
@@ -82,3 +89,36 @@ def test_specks_leave_no_line_and_an_empty_map_stays_empty():
     edge_map[40:42, 50:52] = 255
     assert thin_edge_maps(edge_map[None], 2.4, 0.3).max() == 0
     assert draw_ridges(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), 20, 30).shape == (20, 30)
+
+
+def test_a_wide_dark_margin_moves_the_ridge_and_changes_nothing_else():
+    edge_map, _ = line_map(0.35, 4.0)
+    wide = np.pad(edge_map, ((70, 11), (33, 140)))
+    points, normals, values = ridge_points(edge_map, 1.2, 0.3)
+    moved, same_normals, same_values = ridge_points(wide, 1.2, 0.3)
+    inner = ((points > 5) & (points < SIZE - 6)).all(axis=1)  # beyond, the border of the small map repeats its pixels
+    shared = ((moved - [33, 70] > 5) & (moved - [33, 70] < SIZE - 6)).all(axis=1)
+    np.testing.assert_allclose(moved[shared] - [33, 70], points[inner], atol=1e-4)  # f32
+    np.testing.assert_allclose(same_normals[shared], normals[inner], atol=1e-4)
+    np.testing.assert_array_equal(same_values[shared], values[inner])
+
+
+def test_drawn_ridges_match_a_pixel_by_pixel_drawing(generator):
+    points, angles, values = generator.uniform(0, 29, (30, 2)), generator.uniform(0, 7, 30), generator.random(30)
+    normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    expected = np.zeros((30, 30))
+    for point, normal, value in zip(points, normals, values):
+        for row, column in np.ndindex(30, 30):
+            away = np.array([column, row]) - point
+            if np.abs(np.array([column, row]) - np.rint(point)).max() <= PATCH:
+                across = away @ normal
+                beyond = max(away @ away - across**2 - 1, 0)
+                expected[row, column] = max(expected[row, column], value * np.exp(-0.5 * (across**2 + beyond)))
+    drawn = draw_ridges(points, normals, values, 30, 30, sigma=1.0)
+    np.testing.assert_allclose(drawn, expected * 255, atol=0.501)
+
+
+def test_thinning_does_not_depend_on_the_threads():
+    maps = np.stack([line_map(angle, 4.0)[0] for angle in np.linspace(0, 3, 7)])
+    expected = thin_edge_maps(maps, 4.0, 0.3, threads=1)
+    np.testing.assert_array_equal(thin_edge_maps(maps, 4.0, 0.3, threads=3), expected)

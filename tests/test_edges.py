@@ -1,10 +1,15 @@
 """From points to edges: filtering, clustering, ordering, fitting, Bezier curves and the edge file."""
 
+import heapq
 import json
 
 import numpy as np
 import pytest
+from scipy.interpolate import BSpline
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from taichi_edges.bezier import (
     LENGTH_SEGMENTS,
@@ -13,10 +18,18 @@ from taichi_edges.bezier import (
     evaluate_bezier,
 )
 from taichi_edges.edge_set import EdgeSet, read_edges, write_edges
-from taichi_edges.edges.clustering import UNASSIGNED, grow_clusters
+from taichi_edges.edges.clustering import (
+    DIRECTION_MEMORY,
+    UNASSIGNED,
+    alignment,
+    grow_clusters,
+    members_of_clusters,
+    neighbor_graph,
+    seed_order,
+)
 from taichi_edges.edges.filtering import filter_points, statistical_inliers
-from taichi_edges.edges.fitting import fit_cluster, fit_clusters, fit_line, nearest_on_chain
-from taichi_edges.edges.ordering import order_points
+from taichi_edges.edges.fitting import BENDING, _lsq_chain, fit_cluster, fit_clusters, fit_line, nearest_on_chain
+from taichi_edges.edges.ordering import _bridge, connected_graph, order_points
 from taichi_edges.errors import UserError
 from taichi_edges.scene import ClusterConfig, FilterConfig, FitConfig
 from taichi_edges.views import Views
@@ -150,6 +163,53 @@ def test_hardly_any_points_are_no_cluster(count):
     np.testing.assert_array_equal(labels, np.full(count, UNASSIGNED))
 
 
+def test_members_are_grouped_by_label(generator):
+    labels = generator.integers(-1, 6, 200)
+    labels[labels == 3] = 7  # two labels that nothing has
+    groups = members_of_clusters(labels)
+    assert len(groups) == 8
+    for label, members in enumerate(groups):
+        np.testing.assert_array_equal(members, np.flatnonzero(labels == label))
+    assert members_of_clusters(np.zeros(0, int)) == members_of_clusters(np.full(4, UNASSIGNED)) == []
+
+
+def slow_clusters(points, directions, config):
+    """The traversal point by point, as the paper says it; clusters by falling size."""
+    graph = neighbor_graph(points, config.neighbors, config.max_gap)
+    aligned = alignment(directions, graph)
+    labels, running, seeds = np.full(len(points), UNASSIGNED), directions.copy(), []
+    for seed in seed_order(points, directions, graph, aligned):
+        if labels[seed] != UNASSIGNED:
+            continue
+        labels[seed], queue = len(seeds), [(0.0, seed)]
+        while queue:
+            travelled, point = heapq.heappop(queue)
+            for slot, neighbor in enumerate(graph.indices[point]):
+                cosine = directions[neighbor] @ running[point]
+                far = neighbor < 0 or aligned[point, slot] < config.theta or abs(cosine) < config.theta
+                if far or labels[neighbor] != UNASSIGNED:
+                    continue
+                newest = np.sign(cosine) * directions[neighbor]
+                blend = DIRECTION_MEMORY * running[point] + (1 - DIRECTION_MEMORY) * newest
+                labels[neighbor], running[neighbor] = len(seeds), blend / np.linalg.norm(blend)
+                heapq.heappush(queue, (travelled + graph.distances[point, slot], neighbor))
+        seeds.append(seed)
+    sizes = np.bincount(labels, minlength=len(seeds))
+    order = [label for label in np.argsort(-sizes, kind="stable") if sizes[label] >= config.min_points]
+    return np.array([order.index(label) if label in order else UNASSIGNED for label in labels])
+
+
+def test_clusters_of_a_tangle_match_the_slow_traversal(generator):
+    lines = [noisy_line(*generator.random((2, 3)), 60, NOISE, seed) for seed in range(12)]
+    points, directions = joined(*lines, CIRCLE)
+    directions = directions + generator.normal(0, 0.2, directions.shape)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    config = ClusterConfig(max_gap=0.05)
+    labels = grow_clusters(points, directions, config)
+    assert labels.max() > 5
+    np.testing.assert_array_equal(labels, slow_clusters(points, directions, config))
+
+
 # --------------------------------------------------------------------------------------------------------- ordering
 
 CLOSED = {
@@ -205,6 +265,24 @@ def test_arc_length_goes_once_round_a_circle():
 def test_coinciding_points_are_ordered_too():
     ordering = order_points(np.repeat([[0.0, 0, 0], [0.1, 0, 0]], 6, axis=0))
     assert ordering.length == pytest.approx(0.1) and not ordering.closed
+
+
+def test_pieces_of_a_graph_are_joined_by_their_shortest_connections(generator):
+    """Slow twin: all distances at once, and always the nearest point outside the piece of the first point."""
+    points = (generator.random((9, 3))[:, None] + generator.normal(0, 0.01, (9, 12, 3))).reshape(-1, 3)
+    labels = np.arange(9).repeat(12)
+    distances = cdist(points, points)
+    expected, inside = {}, labels == 0
+    while not inside.all():
+        gaps = np.where(inside[:, None] & ~inside, distances, np.inf)
+        a, b = np.unravel_index(gaps.argmin(), gaps.shape)
+        expected[min(a, b), max(a, b)] = distances[a, b]
+        inside |= labels == labels[b]
+    bridged = _bridge(points, coo_array((108, 108)).tocsr(), labels).tocoo()
+    found = {(a, b): value for a, b, value in zip(*bridged.coords, bridged.data) if a < b}
+    assert bridged.nnz == 2 * len(found) and found.keys() == expected.keys()
+    np.testing.assert_allclose([found[pair] for pair in expected], list(expected.values()))
+    assert connected_components(connected_graph(points), directed=False)[0] == 1
 
 
 # ---------------------------------------------------------------------------------------------------------- fitting
@@ -317,6 +395,23 @@ def test_every_cluster_is_counted_once():
 def test_no_clusters_give_no_edges():
     edges, counts = fit_clusters(np.zeros((3, 3)), np.full(3, UNASSIGNED), FitConfig())
     assert len(edges) == 0 and sum(counts.values()) == 0
+
+
+@pytest.mark.parametrize("pieces", [1, 2, 5])
+def test_the_chain_is_the_b_spline_with_double_knots(generator, pieces):
+    """Slow twin: SciPy's basis functions, with the same penalty on the second differences of the coefficients."""
+    parameters = generator.uniform(0, pieces, 40)
+    parameters[:3] = 0, pieces, pieces // 2  # both ends and a joint
+    points, weights = generator.normal(size=(40, 3)), generator.random(40)
+    knots = np.repeat(np.arange(pieces + 1.0), 2)
+    knots = np.concatenate([[0, 0], knots, [pieces, pieces]])
+    design = BSpline.design_matrix(parameters, knots, 3).toarray() * np.sqrt(weights)[:, None]
+    bend = np.diff(np.eye(2 * pieces + 2), 2, axis=0) * BENDING * np.sqrt(weights.sum())
+    targets = np.concatenate([points * np.sqrt(weights)[:, None], np.zeros((2 * pieces, 3))])
+    spline = BSpline(knots, np.linalg.lstsq(np.concatenate([design, bend]), targets, rcond=None)[0], 3)
+    within = np.linspace(0, 1, 11)[:-1]
+    found = evaluate_bezier(_lsq_chain(parameters, points, weights, pieces), within)
+    np.testing.assert_allclose(found, spline(np.arange(pieces)[:, None] + within), atol=1e-9)
 
 
 def test_distances_to_a_chain_match_brute_force(generator):

@@ -451,6 +451,17 @@ def test_an_obj_is_preferred_to_the_parameters(tmp_path):
     np.testing.assert_allclose(truth.curves[1], [[1, 0, 0.5], [1, 1, 0.5]])
 
 
+def test_only_the_curves_of_an_abc_folder_are_read(tmp_path):
+    """The surfaces after them are 98 % of the file; where the curves do not come first, all of it is read."""
+    surfaces = "surfaces:\n- {face_indices: [0, 1], type: Plane}\n"
+    alone = read_ground_truth(abc_folder(tmp_path, ABC_LINE + ABC_ARC))
+    for features in (ABC_LINE + ABC_ARC + surfaces, surfaces + ABC_LINE + ABC_ARC):
+        truth = read_ground_truth(abc_folder(tmp_path, features))
+        np.testing.assert_array_equal(truth.points, alone.points)
+    assert "features" in refusal(abc_folder(tmp_path, ABC_LINE + "- {sharp: [\n" + surfaces))
+    assert "features" in refusal(abc_folder(tmp_path, surfaces))
+
+
 UNMATCHED_SOURCES = (
     '{"lines_end_pts": [[[0, 0, 0], [1, 0, 0]]], "curves_ctl_pts": [], "line_sources": [], "curve_sources": []}'
 )

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from taichi_edges.artefacts import remove_unfinished, replacing
+from taichi_edges.artefacts import digest_file, remove_unfinished, replacing
 from taichi_edges.cameras import Similarity, invert_pose
 from taichi_edges.edge_set import EdgeSet, read_edges, write_edges
 from taichi_edges.errors import UserError
@@ -607,6 +607,35 @@ def test_one_seed_gives_the_same_edges_and_another_seed_others(finished, tmp_pat
     assert other.read_bytes() != first.read_bytes()
     assert read_edges(other)[1]["seed"] == 1
     assert (tmp_path / "tiny" / "gaussians.ply").read_bytes() != (runs / "tiny" / "gaussians.ply").read_bytes()
+
+
+# ------------------------------------------------------------------------------------------------------------- speed
+
+
+def test_what_is_up_to_date_or_mistaken_waits_for_no_library(copied):
+    """Neither SciPy nor OpenCV, Open3D and Taichi are imported before a stage needs them."""
+    scene, runs, _ = copied
+    code = (
+        "import sys, run; status = run.main(sys.argv[1:]); "
+        "print('imported:', *{'scipy', 'cv2', 'open3d', 'taichi', 'rich'} & sys.modules.keys()); sys.exit(status)"
+    )
+    for settings, status in ((), 0), (("--set", "train.epoch=3"), 2):
+        arguments = [sys.executable, "-c", code, *command(scene, runs, *settings)]
+        done = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stdout.splitlines()[-1]) == (status, "imported:")
+
+
+def test_views_are_read_once_and_again_when_they_have_changed(copied):
+    _, _, folder = copied
+    path, before = folder / "views.npz", digest_file(folder / "views.npz")
+    views = read_views(path)
+    assert read_views(path) is views and digest_file(path) == before
+    with pytest.raises(ValueError, match="read-only"):
+        views.edge_maps[0, 0, 0] = 1
+    turned = Views(views.names, 255 - views.edge_maps, views.intrinsics, views.world_to_camera, views.image_paths)
+    write_views(path, turned)
+    np.testing.assert_array_equal(read_views(path).edge_maps, turned.edge_maps)
+    assert digest_file(path) != before
 
 
 # -------------------------------------------------------------------------------------------------------- progress

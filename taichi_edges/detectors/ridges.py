@@ -16,12 +16,20 @@ DRAWN_SIGMA = 1.0  # px; about what DexiNed draws (FWHM 2.4 px), wide enough to 
 MIN_CURVATURE = 0.1  # of that of a line as narrow as the scale; on a flank rounding alone leaves a faint curvature
 MIN_PIXELS = 6  # a ridge of fewer is no line
 PATCH = 3  # px; half size of the patch in which a ridge point is drawn
+DRAWN_AT_ONCE = 256  # points; few enough that their patches stay in the cache and in memory that is there already
+
+
+def _reach(sigma):
+    """Pixels from which a derivative takes its value, to each side."""
+    return int(np.ceil(4 * sigma))
 
 
 def gaussian_derivatives(image, sigma):
-    """First and second derivatives (gx, gy, gxx, gxy, gyy) of an (H, W) float32 image smoothed by `sigma` pixels."""
-    reach = int(np.ceil(4 * sigma))
-    x = np.arange(-reach, reach + 1, dtype=np.float64)
+    """First and second derivatives of an (H, W) float32 image smoothed by `sigma` pixels: gx, gy, gxx, gxy, gyy.
+
+    They come one after the other, so that whoever wants them at a few pixels does not hold five images.
+    """
+    x = np.arange(-_reach(sigma), _reach(sigma) + 1, dtype=np.float64)
     smooth = np.exp(-0.5 * (x / sigma) ** 2)
     smooth /= smooth.sum()
     # Correlation kernels; normalised so that they differentiate x and x^2 / 2 exactly.
@@ -31,7 +39,8 @@ def gaussian_derivatives(image, sigma):
     second -= second.mean()
     second /= (second * x**2 / 2).sum()
     pairs = ((first, smooth), (smooth, first), (second, smooth), (first, first), (smooth, second))
-    return [cv2.sepFilter2D(image, cv2.CV_32F, along, down, borderType=cv2.BORDER_REPLICATE) for along, down in pairs]
+    for along, down in pairs:
+        yield cv2.sepFilter2D(image, cv2.CV_32F, along, down, borderType=cv2.BORDER_REPLICATE)
 
 
 def ridge_points(edge_map, sigma, threshold):
@@ -40,8 +49,13 @@ def ridge_points(edge_map, sigma, threshold):
     edge_map: (H, W) uint8. sigma: smoothing scale, pixels. threshold: 0..1; the map's value a ridge needs.
     Returns points (n, 2) as (u, v), pixel centres at integers; unit normals (n, 2) across the line; values (n,) 0..1.
     """
-    image = edge_map.astype(np.float32) / 255.0
-    gx, gy, gxx, gxy, gyy = gaussian_derivatives(image, sigma)
+    top, left, edge_map = _window(edge_map, threshold, _reach(sigma))
+    image = edge_map.astype(np.float32)
+    image /= 255.0
+    bright = image >= threshold
+    rows, columns = np.nonzero(bright)  # a few percent of the pixels: what follows is computed for them alone
+    gx, gy, gxx, gxy, gyy = (derivative[rows, columns] for derivative in gaussian_derivatives(image, sigma))
+    values = image[rows, columns]
     # Across the line: the eigenvector of the Hessian with the most negative eigenvalue.
     angle = 0.5 * np.arctan2(2 * gxy, gxx - gyy)  # of the largest eigenvalue
     nx, ny = -np.sin(angle), np.cos(angle)
@@ -49,38 +63,58 @@ def ridge_points(edge_map, sigma, threshold):
     with np.errstate(divide="ignore", invalid="ignore"):
         offset = -(gx * nx + gy * ny) / curvature
     du, dv = offset * nx, offset * ny
-    sharp = curvature < -MIN_CURVATURE * image / sigma**2
-    on_ridge = sharp & (np.abs(du) <= 0.5) & (np.abs(dv) <= 0.5) & (image >= threshold)
-    on_ridge = _without_specks(on_ridge)
-    rows, columns = np.nonzero(on_ridge)
-    points = np.stack([columns + du[on_ridge], rows + dv[on_ridge]], axis=1)
-    normals = np.stack([nx[on_ridge], ny[on_ridge]], axis=1)
-    return points, normals, image[on_ridge]
+    sharp = curvature < -MIN_CURVATURE * values / sigma**2
+    bright[rows, columns] = sharp & (np.abs(du) <= 0.5) & (np.abs(dv) <= 0.5)
+    on_ridge = _without_specks(bright, rows, columns)
+    points = np.stack([left + columns + du, top + rows + dv], axis=1)[on_ridge]
+    return points, np.stack([nx, ny], axis=1)[on_ridge], values[on_ridge]
 
 
-def _without_specks(mask):
-    """The (H, W) bool mask without connected pieces of fewer than MIN_PIXELS: ends of bands, noise."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-    return mask & (stats[labels, cv2.CC_STAT_AREA] >= MIN_PIXELS)
+def _window(edge_map, threshold, margin):
+    """Top row, left column and pixels of the part of a map that holds all its bright pixels, `margin` around them."""
+    bright = edge_map >= np.count_nonzero(np.arange(256, dtype=np.float32) / 255.0 < threshold)
+    spans = []
+    for axis, size in ((1, edge_map.shape[0]), (0, edge_map.shape[1])):
+        found = np.flatnonzero(bright.any(axis=axis))
+        spans.append((max(found[0] - margin, 0), min(found[-1] + margin + 1, size)) if len(found) else (0, 1))
+    (top, bottom), (left, right) = spans
+    return top, left, edge_map[top:bottom, left:right]
+
+
+def _without_specks(mask, rows, columns):
+    """(n,) bool: which of the pixels, some of a (H, W) bool mask, are of a connected piece of at least MIN_PIXELS."""
+    labels = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)[1][rows, columns]
+    return (labels > 0) & (np.bincount(labels) >= MIN_PIXELS)[labels]
 
 
 def draw_ridges(points, normals, values, height, width, sigma=DRAWN_SIGMA):
     """(H, W) uint8 map of lines through the points: a Gaussian profile of `sigma` pixels across each, `value` high."""
-    offsets = np.stack(np.meshgrid(*[np.arange(-PATCH, PATCH + 1)] * 2), axis=-1).reshape(-1, 2)
-    centres = np.rint(points).astype(np.int64)
-    pixels = centres[:, None] + offsets
-    away = pixels - points[:, None]
-    across = np.einsum("npc,nc->np", away, normals)
-    along_squared = (away**2).sum(axis=2) - across**2
-    # Each point draws its line no farther than to the next one, or a curve's chords would stand out.
-    heights = values[:, None] * np.exp(-0.5 * (across**2 + np.maximum(along_squared - 1.0, 0.0)) / sigma**2)
     image = np.zeros((height + 2 * PATCH, width + 2 * PATCH), np.float32)
-    np.maximum.at(image, (pixels[..., 1] + PATCH, pixels[..., 0] + PATCH), heights)
-    return np.rint(image[PATCH:-PATCH, PATCH:-PATCH] * 255).astype(np.uint8)
+    for start in range(0, len(points), DRAWN_AT_ONCE):
+        part = slice(start, start + DRAWN_AT_ONCE)
+        _draw_patches(image, points[part], normals[part], values[part], sigma)
+    image *= 255
+    return np.rint(image, out=image)[PATCH:-PATCH, PATCH:-PATCH].astype(np.uint8)
 
 
-def thin_edge_maps(edge_maps, width_px, threshold):
-    """Edge maps reduced to their ridges and redrawn at one width.
+def _draw_patches(image, points, normals, values, sigma):
+    """Draw some of the ridge points into `image`, which is PATCH pixels larger on every side."""
+    centres = np.rint(points)
+    patch = np.arange(2 * PATCH + 1)  # pixels of `image`, and offsets from the point: (n, 1, 7) right, (n, 7, 1) down
+    right = (centres - points)[:, 0, None, None] + (patch - PATCH)
+    down = (centres - points)[:, 1, None, None] + (patch - PATCH)[:, None]
+    across_squared = (right * normals[:, 0, None, None] + down * normals[:, 1, None, None]) ** 2
+    along_squared = right**2 + down**2 - across_squared
+    # Each point draws its line no farther than to the next one, or a curve's chords would stand out.
+    profiles = np.exp(-0.5 * (across_squared + np.maximum(along_squared - 1.0, 0.0)) / sigma**2)
+    heights = (values[:, None, None] * profiles).astype(np.float32)
+    columns, rows = centres.astype(np.int64).T[:, :, None, None]
+    places = (rows + patch[:, None]) * image.shape[1] + columns + patch
+    np.maximum.at(image.reshape(-1), places.ravel(), heights.ravel())  # fast in one dimension and one type only
+
+
+def thin_edge_maps(edge_maps, width_px, threshold, threads=None):
+    """Edge maps reduced to their ridges and redrawn at one width, some of them at a time.
 
     edge_maps: (V, H, W) uint8 with lines about `width_px` wide. threshold: 0..1; ridges with lower values are dropped,
     the others are drawn from half to full height, so that all of them are edge pixels and the sure ones stand out.
@@ -92,5 +126,5 @@ def thin_edge_maps(edge_maps, width_px, threshold):
         points, normals, values = ridge_points(edge_map, sigma, threshold)
         return draw_ridges(points, normals, 0.5 + 0.5 * values, height, width)
 
-    with ThreadPoolExecutor() as pool:  # OpenCV and NumPy release the lock in the long loops
+    with ThreadPoolExecutor(threads) as pool:  # OpenCV and NumPy release the lock in the long loops
         return np.stack(list(pool.map(thin, edge_maps)))

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
-from taichi_edges.edges.clustering import UNASSIGNED
+from taichi_edges.edges.clustering import UNASSIGNED, members_of_clusters
 from taichi_edges.edges.ordering import connected_graph, extremity, two_sides
 
 SCATTER_NEIGHBORS = 8
@@ -25,7 +25,7 @@ def separate_branches(points, labels, min_points):
     """
     separated = np.full(len(labels), UNASSIGNED)
     count = 0
-    waiting = [np.flatnonzero(labels == label) for label in range(labels.max(initial=UNASSIGNED) + 1)][::-1]
+    waiting = members_of_clusters(labels)[::-1]
     while waiting:
         members = waiting.pop()
         if len(members) < min_points:
@@ -57,7 +57,7 @@ def longest_walk(points):
     on_walk = distances <= max(BESIDE * scatter(points), LEAST_BESIDE)
     rest = np.flatnonzero(~on_walk)
     _, groups = connected_components(graph[rest][:, rest], directed=False)
-    return on_walk, [rest[groups == group] for group in range(groups.max(initial=-1) + 1)]
+    return on_walk, [rest[members] for members in members_of_clusters(groups)]
 
 
 def _walk(before, end):

@@ -1,12 +1,23 @@
 """Clusters of oriented points by graph traversal (paper 3.3)."""
 
 import heapq
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 UNASSIGNED = -1
 DIRECTION_MEMORY = 0.7  # share of the edge grown so far in its running direction, against the newest point's
+
+
+def members_of_clusters(labels):
+    """The points of every cluster: a list of ascending index arrays, one for each of the labels 0, 1, ..
+
+    labels: (n,) ints, UNASSIGNED for none. One sort, however many clusters there are.
+    """
+    order = np.argsort(labels, kind="stable")
+    bounds = np.searchsorted(labels[order], np.arange(labels.max(initial=UNASSIGNED) + 2))
+    return [order[start:end] for start, end in zip(bounds[:-1], bounds[1:], strict=True)]
 
 
 @dataclass(frozen=True)
@@ -71,38 +82,53 @@ def grow_clusters(points, directions, config):
         return labels
     graph = neighbor_graph(points, config.neighbors, config.max_gap)
     aligned = alignment(directions, graph)
-    for label, seed in enumerate(seed_order(points, directions, graph, aligned)):
-        if labels[seed] == UNASSIGNED:
-            _grow(seed, label, labels, directions, graph, aligned, config.theta)
-    return _by_size(labels, config.min_points)
+    seeds = seed_order(points, directions, graph, aligned)
+    follows = (graph.indices >= 0) & (aligned >= config.theta)
+    return _by_size(np.array(_traverse(seeds, directions, graph, follows, config.theta)), config.min_points)
 
 
-def _grow(seed, label, labels, directions, graph, aligned, theta):
-    """Label what is reachable from the seed (changes `labels`)."""
-    running = {seed: directions[seed]}
-    labels[seed] = label
-    queue = [(0.0, int(seed))]
-    while queue:
-        travelled, point = heapq.heappop(queue)
-        direction = running[point]
-        for slot, neighbor in enumerate(graph.indices[point]):
-            if neighbor < 0 or labels[neighbor] != UNASSIGNED or aligned[point, slot] < theta:
-                continue
-            cosine = directions[neighbor] @ direction
-            if abs(cosine) < theta:
-                continue
-            blend = DIRECTION_MEMORY * direction + (1 - DIRECTION_MEMORY) * np.sign(cosine) * directions[neighbor]
-            running[neighbor] = blend / np.linalg.norm(blend)
-            labels[neighbor] = label
-            heapq.heappush(queue, (travelled + graph.distances[point, slot], int(neighbor)))
+def _traverse(seeds, directions, graph, follows, theta):
+    """The number of the seed from which every point is reached, a list (n,).
+
+    follows: (n, k) bool, the neighbours that lie along the point's own direction or theirs.
+    """
+    # Python's own lists and floats: reading single numbers out of arrays would take ten times longer.
+    bounds = np.concatenate([[0], np.cumsum(follows.sum(axis=1))]).tolist()
+    neighbors, lengths = graph.indices[follows].tolist(), graph.distances[follows].tolist()
+    directions = directions.tolist()
+    labels, running = [UNASSIGNED] * len(directions), list(directions)
+    for label, seed in enumerate(seeds.tolist()):
+        if labels[seed] != UNASSIGNED:
+            continue
+        labels[seed] = label
+        queue = [(0.0, seed)]
+        while queue:
+            travelled, point = heapq.heappop(queue)
+            direction = running[point]
+            for slot in range(bounds[point], bounds[point + 1]):
+                neighbor = neighbors[slot]
+                if labels[neighbor] == UNASSIGNED and (blend := _blended(direction, directions[neighbor], theta)):
+                    labels[neighbor], running[neighbor] = label, blend
+                    heapq.heappush(queue, (travelled + lengths[slot], neighbor))
+    return labels
+
+
+def _blended(running, newest, theta):
+    """The running direction after a point of direction `newest`, whose sign is arbitrary; None where they disagree."""
+    (a, b, c), (x, y, z) = running, newest
+    cosine = a * x + b * y + c * z
+    if abs(cosine) < theta:
+        return None
+    share = math.copysign(1 - DIRECTION_MEMORY, cosine) if cosine else 0.0
+    a, b, c = DIRECTION_MEMORY * a + share * x, DIRECTION_MEMORY * b + share * y, DIRECTION_MEMORY * c + share * z
+    length = math.sqrt(a * a + b * b + c * c)
+    return a / length, b / length, c / length
 
 
 def _by_size(labels, minimum):
     """Labels renumbered by falling size (ties: first seed first); clusters below `minimum` become UNASSIGNED."""
-    found, sizes = np.unique(labels, return_counts=True)
-    order = np.lexsort((found, -sizes))
-    renumbered = np.full(len(labels), UNASSIGNED)
-    for number, index in enumerate(order):
-        if sizes[index] >= minimum:
-            renumbered[labels == found[index]] = number
-    return renumbered
+    found, cluster, sizes = np.unique(labels, return_inverse=True, return_counts=True)
+    numbers = np.empty(len(found), int)
+    numbers[np.lexsort((found, -sizes))] = np.arange(len(found))
+    numbers[sizes < minimum] = UNASSIGNED
+    return numbers[cluster]

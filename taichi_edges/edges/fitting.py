@@ -3,11 +3,11 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.interpolate import BSpline
 from scipy.spatial import cKDTree
 
-from taichi_edges.bezier import evaluate_bezier
+from taichi_edges.bezier import bernstein, evaluate_bezier
 from taichi_edges.edge_set import EdgeSet
+from taichi_edges.edges.clustering import members_of_clusters
 from taichi_edges.edges.ordering import order_points
 
 ROBUST_ROUNDS = 10
@@ -39,8 +39,8 @@ def fit_clusters(points, labels, config):
     """
     lines, curves, line_sources, curve_sources = [], [], [], []
     counts = dict.fromkeys(("line", "curve", "loop", "short", "degenerate"), 0)
-    for label in range(labels.max(initial=-1) + 1):
-        fit = fit_cluster(points[labels == label], config)
+    for label, members in enumerate(members_of_clusters(labels)):
+        fit = fit_cluster(points[members], config)
         counts[fit.kind] += 1
         if fit.kind == "line":
             lines.append(fit.line)
@@ -59,7 +59,7 @@ def fit_cluster(points, config):
     Errors are mean distances, corrected for the parameters (`corrected_error`): a curve through few points is close to
     them whatever they are.
     """
-    if len(np.unique(points, axis=0)) < 2:
+    if len(points) == 0 or not np.ptp(points, axis=0).any():
         return Fit("degenerate")
     line, line_error = fit_line(points, config.line_tolerance)
     if len(points) >= 4:
@@ -147,39 +147,37 @@ def total_turning(points, arc):
 
 
 def _fit_spline(points, parameters, weights, pieces, closed):
-    """Least-squares cubic B-spline over parameters in 0..1 with `pieces` equal knot spans -> (pieces, 4, 3) Beziers."""
-    knots = np.linspace(0.0, 1.0, pieces + 1)
-    if closed:  # the data repeated on both sides make the middle period periodic
-        parameters = np.concatenate([parameters - 1, parameters, parameters + 1])
-        points, weights = np.tile(points, (3, 1)), np.tile(weights, 3)
-        knots = np.concatenate([knots[:-1] - 1, knots[:-1], knots + 1])
-    order = np.argsort(parameters, kind="stable")
-    spline = _lsq_spline(parameters[order], points[order], weights[order], knots)
-    controls = _hermite_to_bezier(spline(knots), spline.derivative()(knots), np.diff(knots))
+    """Least-squares chain of cubics over parameters in 0..1, in `pieces` equal spans -> (pieces, 4, 3) Beziers."""
     if not closed:
-        return controls
-    controls = controls[pieces : 2 * pieces].copy()
+        return _lsq_chain(parameters * pieces, points, weights, pieces)
+    # The data repeated on both sides make the middle period periodic.
+    parameters = np.concatenate([parameters, parameters + 1, parameters + 2])
+    chain = _lsq_chain(parameters * pieces, np.tile(points, (3, 1)), np.tile(weights, 3), 3 * pieces)
+    controls = chain[pieces : 2 * pieces].copy()
     joint = 0.5 * (controls[0, 0] + controls[-1, 3])
     controls[0, 0] = controls[-1, 3] = joint
     return controls
 
 
-def _hermite_to_bezier(values, derivatives, spans):
-    """Cubics with the given values (m + 1, 3) and derivatives (m + 1, 3) at the ends of m spans -> (m, 4, 3)."""
-    thirds = spans[:, None] / 3
-    first, last = values[:-1], values[1:]
-    return np.stack([first, first + derivatives[:-1] * thirds, last - derivatives[1:] * thirds, last], axis=1)
+def _lsq_chain(parameters, points, weights, pieces):
+    """Weighted least-squares chain of cubics with a continuous tangent; piece i has the parameters i .. i + 1.
 
-
-def _lsq_spline(parameters, points, weights, knots):
-    """Weighted least-squares cubic spline; a faint penalty on bending carries it over knot spans without points."""
-    clamped = np.concatenate([[knots[0]] * 2, np.repeat(knots, 2), [knots[-1]] * 2])
-    inside = np.clip(parameters, knots[0], knots[-1])
-    design = BSpline.design_matrix(inside, clamped, 3).toarray() * np.sqrt(weights)[:, None]
+    With equal spans a joint is the middle of the two control points next to it, so the unknowns are the polygon of the
+    inner control points and the chain's two ends: the coefficients of a cubic B-spline with double knots. A faint
+    penalty on the bending of that polygon carries the chain over pieces without points. Returns (pieces, 4, 3).
+    """
+    local = np.tile([[0.5, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0.5, 0.5]], (pieces, 1, 1))
+    local[0, 0], local[-1, 3] = (1, 0, 0, 0), (0, 0, 0, 1)  # (pieces, 4, 4) control points from unknowns 2 i .. 2 i + 3
+    unknowns = 2 * np.arange(pieces)[:, None] + np.arange(4)
+    piece = np.clip(parameters.astype(int), 0, pieces - 1)
+    design = np.zeros((len(points), 2 * pieces + 2))
+    shares = np.einsum("nb,nbu->nu", bernstein(np.clip(parameters - piece, 0.0, 1.0)), local[piece])
+    np.put_along_axis(design, unknowns[piece], shares, axis=1)
+    rows = np.sqrt(weights)[:, None]
     bend = np.diff(np.eye(design.shape[1]), 2, axis=0) * BENDING * np.sqrt(weights.sum())
-    targets = np.concatenate([points * np.sqrt(weights)[:, None], np.zeros((len(bend), 3))])
-    coefficients = np.linalg.lstsq(np.concatenate([design, bend]), targets, rcond=None)[0]
-    return BSpline(clamped, coefficients, 3)
+    targets = np.concatenate([points * rows, np.zeros((len(bend), 3))])
+    polygon = np.linalg.lstsq(np.concatenate([design * rows, bend]), targets, rcond=None)[0]
+    return local @ polygon[unknowns]
 
 
 def nearest_on_chain(points, curves):
@@ -191,15 +189,13 @@ def nearest_on_chain(points, curves):
     samples = evaluate_bezier(curves, t).reshape(-1, 3)
     parameters = (np.arange(len(curves))[:, None] + t).ravel()
     nearest = cKDTree(samples).query(points)[1]
-    sides = []
-    for first in (np.maximum(nearest - 1, 0), np.minimum(nearest, len(samples) - 2)):
-        start, chord = samples[first], samples[first + 1] - samples[first]
-        squared = np.maximum((chord**2).sum(axis=1), 1e-300)  # 0 at the joints, where two samples coincide
-        share = np.clip(((points - start) * chord).sum(axis=1) / squared, 0.0, 1.0)
-        reached = parameters[first] + share * (parameters[first + 1] - parameters[first])
-        sides.append((np.linalg.norm(start + share[:, None] * chord - points, axis=1), reached))
-    (before, at_before), (after, at_after) = sides
-    return np.minimum(before, after), np.where(before < after, at_before, at_after)
+    first = np.stack([np.maximum(nearest - 1, 0), np.minimum(nearest, len(samples) - 2)])  # (2, n) chords
+    start, chord = samples[first], samples[first + 1] - samples[first]
+    squared = np.maximum((chord**2).sum(axis=2), 1e-300)  # 0 at the joints, where two samples coincide
+    share = np.clip(((points - start) * chord).sum(axis=2) / squared, 0.0, 1.0)
+    before, after = np.linalg.norm(start + share[:, :, None] * chord - points, axis=2)
+    reached = parameters[first] + share * (parameters[first + 1] - parameters[first])
+    return np.minimum(before, after), np.where(before < after, *reached)
 
 
 def _reparametrize(arc, parameters, length, closed):

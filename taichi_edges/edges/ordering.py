@@ -7,6 +7,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
+from taichi_edges.edges.clustering import members_of_clusters
+
 GRAPH_NEIGHBORS = 8
 REACH = 3.0  # graph edges longer than this many times the longest gap of the spanning tree are shortcuts
 WAIST = (0.25, 0.75)  # of the longest walk: an open edge is one strip here, a closed one two
@@ -59,19 +61,22 @@ def connected_graph(points):
 
 
 def _bridge(points, graph, labels):
-    """Join the pieces of a graph by their shortest connections."""
-    graph = graph.tolil()
-    while (pieces := labels.max() + 1) > 1:
-        inside = np.flatnonzero(labels == 0)
-        outside = np.flatnonzero(labels != 0)
-        distances, nearest = cKDTree(points[inside]).query(points[outside])
-        best = int(np.argmin(distances))
-        a, b = inside[nearest[best]], outside[best]
-        graph[a, b] = graph[b, a] = max(distances[best], 1e-12)
-        labels = np.where(labels == labels[b], 0, labels)
-        _, labels = np.unique(labels, return_inverse=True)
-        assert labels.max() + 1 < pieces
-    return graph.tocsr()
+    """Join the pieces of a graph by their shortest connections, one piece after the other to that of label 0."""
+    pieces = members_of_clusters(labels)
+    newest, outside = pieces[0], np.flatnonzero(labels)
+    gaps, nearest = np.full(len(points), np.inf), np.zeros(len(points), int)  # from the points outside to those joined
+    bridges = []
+    while len(outside):
+        distances, found = cKDTree(points[newest]).query(points[outside])
+        nearer = distances < gaps[outside]
+        gaps[outside[nearer]], nearest[outside[nearer]] = distances[nearer], newest[found[nearer]]
+        best = outside[np.argmin(gaps[outside])]
+        bridges.append(best)
+        newest = pieces[labels[best]]
+        outside = outside[labels[outside] != labels[best]]
+    ends, lengths = (nearest[bridges], bridges), np.maximum(gaps[bridges], 1e-12)
+    added = coo_array((lengths, ends), shape=graph.shape).tocsr()
+    return graph.maximum(added).maximum(added.T)
 
 
 def two_sides(graph, from_start):
@@ -82,8 +87,8 @@ def two_sides(graph, from_start):
     """
     length = from_start.max()
     waist = np.flatnonzero((from_start >= WAIST[0] * length) & (from_start <= WAIST[1] * length))
-    pieces, labels = connected_components(graph[waist][:, waist], directed=False)
-    strips = [waist[labels == piece] for piece in range(pieces)]
+    _, labels = connected_components(graph[waist][:, waist], directed=False)
+    strips = [waist[members] for members in members_of_clusters(labels)]
     least = SPAN * (WAIST[1] - WAIST[0]) * length
     strips = [strip for strip in strips if np.ptp(from_start[strip]) >= least]
     if len(strips) != 2:

@@ -9,7 +9,6 @@ One "mm" is 0.001 of the normalised unit. Edges and truth must be in the same fr
 """
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from taichi_edges.bezier import evaluate_bezier
 from taichi_edges.errors import UserError
@@ -116,6 +115,8 @@ def nearest_distances(points, others):
     """(n,) float32 distances from each of the points to the nearest of the others; infinite where there is none."""
     if not len(others):
         return np.full(len(points), np.inf, dtype=np.float32)
+    from scipy.spatial import cKDTree
+
     return cKDTree(others).query(points)[0].astype(np.float32)
 
 
@@ -199,6 +200,8 @@ def neighbours_counted_before(points, pieces, rank):
 
     Returns two (k,) index arrays: the sample, and its neighbour on the earlier piece.
     """
+    from scipy.spatial import cKDTree
+
     pairs = cKDTree(points).query_pairs(DUPLICATE_DISTANCE, output_type="ndarray")
     pairs = pairs[pieces[pairs[:, 0]] != pieces[pairs[:, 1]]]
     swap = rank[pieces[pairs[:, 0]]] < rank[pieces[pairs[:, 1]]]

@@ -23,6 +23,7 @@ REFERENCE_WIDTH = 800  # pixels; strokes and letters grow with wider images
 SHEET_WIDTH = 1600  # pixels; a contact sheet is scaled down to this
 SHEET_GAP = 8  # pixels
 TEXT_COLOUR = (40, 40, 40)
+GREYS = np.arange(256)
 SAME_SHAPE = 0.01  # an image whose aspect is off by more is not a picture of this view
 
 
@@ -87,9 +88,9 @@ def background(views, view):
         height, width = colour.shape[:2]
         if abs(width * views.height / (height * views.width) - 1.0) < SAME_SHAPE:
             resized = cv2.resize(colour, (views.width, views.height), interpolation=cv2.INTER_AREA)
-            return (resized + IMAGE_FADE * (255.0 - resized)).round().astype(np.uint8)
-    faded = 255.0 - FADED_TO * views.edge_maps[view]
-    return np.repeat(faded.round().astype(np.uint8)[:, :, None], 3, axis=2)
+            return cv2.LUT(resized, (GREYS + IMAGE_FADE * (255.0 - GREYS)).round().astype(np.uint8))
+    faded = cv2.LUT(views.edge_maps[view], (255.0 - FADED_TO * GREYS).round().astype(np.uint8))
+    return np.repeat(faded[:, :, None], 3, axis=2)
 
 
 def draw_edges(picture, projection, edges):
@@ -170,8 +171,8 @@ def _paint(picture, colour, segments, stroke):
     height, width = picture.shape[:2]
     mask = np.zeros((height * OVERSAMPLING, width * OVERSAMPLING), np.uint8)
     fine = OVERSAMPLING * segments[..., :2] / segments[..., 2:] + 0.5 * (OVERSAMPLING - 1)
-    for start, end in np.rint(fine * 2**SUBPIXEL_BITS).astype(int).tolist():
-        cv2.line(mask, start, end, 255, round(stroke * OVERSAMPLING), cv2.LINE_8, SUBPIXEL_BITS)
+    ends = np.rint(fine * 2**SUBPIXEL_BITS).astype(np.int32)
+    cv2.polylines(mask, list(ends), False, 255, round(stroke * OVERSAMPLING), cv2.LINE_8, SUBPIXEL_BITS)
     coverage = cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA)
     touched = coverage > 0
     alpha = coverage[touched, None] / 255.0
@@ -193,12 +194,18 @@ def _read_colour(path):
         return None
     if picture is None or picture.dtype not in (np.uint8, np.uint16):
         return None
-    picture = picture.astype(np.float64) * (255.0 / np.iinfo(picture.dtype).max)
-    picture = np.atleast_3d(picture)
-    if picture.shape[2] == 4:
-        alpha = picture[:, :, 3:] / 255.0
-        picture = picture[:, :, :3] * alpha + 255.0 * (1.0 - alpha)
-    return np.broadcast_to(picture, (*picture.shape[:2], 3)).round().astype(np.uint8)
+    full = np.iinfo(picture.dtype).max
+    colour = picture if full == 255 else (picture * (255.0 / full)).round().astype(np.uint8)
+    if picture.ndim == 2:
+        return cv2.cvtColor(colour, cv2.COLOR_GRAY2BGR)
+    if picture.shape[2] == 3:
+        return colour
+    colour, alpha = cv2.cvtColor(colour, cv2.COLOR_BGRA2BGR), cv2.extractChannel(picture, 3)
+    colour[alpha == 0] = 255
+    mixed = (alpha > 0) & (alpha < full)  # few, along outlines
+    share = alpha[mixed, None] / full
+    colour[mixed] = (picture[mixed, :3] * (255.0 / full) * share + 255.0 * (1.0 - share)).round()
+    return colour
 
 
 def _write_png(path, picture):

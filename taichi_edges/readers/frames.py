@@ -5,7 +5,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from taichi_edges.cameras import OPENGL_TO_OPENCV, Similarity, inside_image, invert_pose, project
@@ -71,10 +70,10 @@ def matrix(values, shape, where, key):
     return array
 
 
-def build_views(frames, config, box, progress):
+def build_views(frames, config, box, progress, threads=None):
     """Check the frames, decode the edge maps and bring the scene box into the unit cube.
 
-    config: the scene's `source` section. box: (2, 3) corners, input units.
+    config: the scene's `source` section. box: (2, 3) corners, input units. threads: None for as many as pay.
     """
     frames = _without_skipped(frames, config.skip)
     _check_names(frames)
@@ -82,7 +81,7 @@ def build_views(frames, config, box, progress):
     _check_poses(frames, poses)
     opengl = frames.opengl if config.axes == "auto" else config.axes == "opengl"
     poses = poses @ OPENGL_TO_OPENCV if opengl else poses
-    edge_maps = _read_edge_maps(frames, progress)
+    edge_maps = _read_edge_maps(frames, progress, threads)
     height, width = edge_maps.shape[1:]
     intrinsics = np.stack([intrinsics_for(width, height) for intrinsics_for in frames.intrinsics])
     _check_intrinsics(frames, intrinsics, width, height, progress)
@@ -177,7 +176,7 @@ def _check_intrinsics(frames, intrinsics, width, height, progress):
         progress.warn(f"{off_centre.sum()} of {len(off_centre)} views: {what} (resized after calibration?): {names}")
 
 
-def _read_edge_maps(frames, progress):
+def _read_edge_maps(frames, progress, threads):
     """(V, H, W) uint8, decoded in parallel; missing, damaged and wrongly sized maps are named."""
     paths = [Path(path) for path in frames.edge_paths]
     missing = np.array([not path.is_file() for path in paths])
@@ -186,7 +185,7 @@ def _read_edge_maps(frames, progress):
         raise UserError(f"{paths[0].parent}: no edge map found here; check source.edges ({folders})")
     problem = f"the edge map is missing ({paths[int(missing.argmax())]})"
     _refuse(frames, missing, f"{problem}; run the detector on it, {LEAVE_OUT}")
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(threads) as pool:
         maps = list(pool.map(read_grey, paths))
     broken = np.array([edge_map is None for edge_map in maps])
     problem = f"the edge map is truncated or not an 8- or 16-bit image ({paths[int(broken.argmax())]})"
@@ -200,18 +199,18 @@ def _read_edge_maps(frames, progress):
         problem = f"the edge map is {width} x {height} px, but {expected} {size[0]} x {size[1]} px"
         _refuse(frames, wrong, f"{problem}; write it in that size, {LEAVE_OUT}")
     maps = np.stack(maps)
-    empty = ~(maps >= 128).any(axis=(1, 2))
+    shares = np.array([np.count_nonzero(edge_map >= 128) for edge_map in maps]) / maps[0].size
+    empty = shares == 0
     if empty.all():
         problem = "no edge map has an edge pixel, a value of 128 or more; scale the maps to 0..255"
         raise UserError(f"{paths[0].parent}: {problem}, or check source.edges")
-    share = float((maps >= 128).mean())
-    if share > MOSTLY_EDGES:
-        problem = f"{100 * share:.0f} % of all pixels are edge pixels; edges must be white on black: invert the maps"
+    if shares.mean() > MOSTLY_EDGES:
+        problem = (
+            f"{100 * shares.mean():.0f} % of all pixels are edge pixels; edges must be white on black: invert the maps"
+        )
         raise UserError(f"{paths[0].parent}: {problem}, or check source.edges")
-    white = (maps >= 128).mean(axis=(1, 2)) > MOSTLY_EDGES
-    _refuse(
-        frames, white, f"most of the edge map is edge pixels, white; edges are thin lines: write it again, {LEAVE_OUT}"
-    )
+    problem = "most of the edge map is edge pixels, white; edges are thin lines: write it again"
+    _refuse(frames, shares > MOSTLY_EDGES, f"{problem}, {LEAVE_OUT}")
     if empty.any():
         names = [name for name, is_empty in zip(frames.names, empty, strict=True) if is_empty]
         progress.warn(f"{len(names)} of {len(maps)} edge maps have no edge pixel and teach nothing: {name_some(names)}")
@@ -236,6 +235,8 @@ def read_grey(path):
 
     16-bit maps are brought to 8 bits.
     """
+    import cv2
+
     if not is_whole(path):
         return None
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
