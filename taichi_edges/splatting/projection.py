@@ -119,14 +119,18 @@ def box_of(splat, variances, depth, width, height):
 
 
 def make_project(gaussians, cameras, target):
-    """Kernel project(count, view): GaussianFields -> SplatFields.splats; its `.grad` is Taichi's own."""
-    splats = target.splats
+    """Kernel project(count, view): GaussianFields -> SplatFields.splats, where the boxes are not empty.
+
+    Its `.grad` is Taichi's own. Of a large scene a view sees a small part; the rest costs nothing on the way back.
+    """
+    splats, boxes = target.splats, target.boxes
     splat_of = make_splat_of(gaussians, cameras, exact_exp2)
 
     @ti.kernel
     def project(count: ti.i32, view: ti.i32):
         for i in range(count):
-            splat, variances, depth = splat_of(i, view)
-            splats[i] = splat
+            if boxes[i][1] > boxes[i][0]:
+                splat, variances, depth = splat_of(i, view)
+                splats[i] = splat
 
     return project
