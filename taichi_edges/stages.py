@@ -164,8 +164,13 @@ def cluster(run):
     """`gaussians.ply`, `views.npz` -> `points.ply` (filtered oriented points, input frame) and `clusters.npz`."""
     from taichi_edges.exporters.point_cloud import write_oriented_points
     from taichi_edges.exporters.splats import read_gaussians
+    from taichi_edges.kernels.device import is_running
     from taichi_edges.splatting.gaussians import Gaussians
+    from taichi_edges.splatting.training import start_taichi
 
+    if not is_running(run.arch, run.threads):  # after the training it is
+        with contextlib.redirect_stdout(io.StringIO()):
+            start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)
     views = read_views(run.path("views.npz"))
     gaussians = Gaussians(*read_gaussians(run.path("gaussians.ply")))
     means = views.similarity.to_unit(gaussians.means.astype(np.float64))
