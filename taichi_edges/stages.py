@@ -133,15 +133,18 @@ def _start(run, views, generator):
     """The Gaussians that training starts from, as `train.seeds` says."""
     from taichi_edges.exporters.ply import read_vertices, stack_fields
     from taichi_edges.splatting.gaussians import start_gaussians
-    from taichi_edges.splatting.seeding import given_points, random_points, voted_gaussians
+    from taichi_edges.splatting.seeding import LEAST_VOTED, given_points, random_points, voted_gaussians
 
     config = run.config.train
-    if config.seeds == "votes":
+    seeds = config.seeds
+    if seeds == "votes":
         voted = voted_gaussians(views, config.edge_threshold, config.gaussians, config.initial_opacity, generator)
         if voted is not None:
             return voted
-        run.progress.warn("too few places where the views agree on an edge; the training starts from random points")
-    if config.seeds == "points":
+        seeds, instead = ("points", "source.points") if run.config.source.points else ("random", "random points")
+        found = f"the views agree on an edge in fewer than {LEAST_VOTED} places"
+        run.progress.warn(f"{found}; the training starts from {instead} instead")
+    if seeds == "points":
         given = stack_fields(read_vertices(run.path("seeds.ply"), ("x", "y", "z")), ("x", "y", "z"))
         points = given_points(views.similarity.to_unit(given.astype(np.float64)), config.gaussians, generator)
     else:

@@ -7,6 +7,10 @@ import pytest
 import reference_support as reference
 from scipy.spatial import cKDTree
 
+from taichi_edges import stages
+from taichi_edges.exporters.ply import write_float_vertices
+from taichi_edges.pipeline import Run
+from taichi_edges.scene import SceneConfig
 from taichi_edges.splatting import voting
 from taichi_edges.splatting.gaussians import orient_gaussians
 from taichi_edges.splatting.seeding import random_points
@@ -156,6 +160,34 @@ def test_nearly_best_is_what_a_dense_grid_gives(generator):
     found = nearly_best(points, scores, radius)
     np.testing.assert_array_equal(found, scores >= voting.NEARLY * np.array(around, np.float32))
     assert 0.01 < found.mean() < 0.5
+
+
+class Warned:
+    """A Progress that keeps the warnings."""
+
+    def __init__(self):
+        self.lines = []
+
+    def warn(self, text):
+        self.lines.append(text)
+
+
+@pytest.mark.parametrize("points, named", [("", "random points"), ("cloud.ply", "source.points")])
+def test_without_votes_the_training_starts_from_the_given_or_random_points(
+    start_taichi, views, tmp_path, generator, points, named
+):
+    start_taichi("f32", 2)
+    blank = replace(views, edge_maps=np.zeros_like(views.edge_maps))
+    given = generator.random((80, 3)).astype(np.float32)
+    write_float_vertices(tmp_path / "seeds.ply", ("x", "y", "z"), given)
+    source = {"reader": "emap", "path": "there", "points": points}
+    config = SceneConfig(source=source, train={"seeds": "votes", "gaussians": 300})
+    warned = Warned()
+    gaussians = stages._start(Run(config, tmp_path, progress=warned), blank, np.random.default_rng(0))
+    assert len(warned.lines) == 1 and warned.lines[0].endswith(f"the training starts from {named} instead")
+    assert len(gaussians) == (80 if points else 300)
+    if points:
+        np.testing.assert_allclose(gaussians.means, given, atol=1e-6)
 
 
 def test_oriented_gaussians_point_along_their_directions(generator):
