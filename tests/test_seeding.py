@@ -54,6 +54,13 @@ def test_the_same_generator_gives_the_same_seeds(start_taichi, views):
     assert one.points.tobytes() == other.points.tobytes()
 
 
+def test_of_too_many_seeds_some_are_drawn(start_taichi, views, seeds):
+    some = vote_seeds(views, 0.5, np.random.default_rng(0), 300)
+    distances, which = cKDTree(seeds.points).query(some.points)
+    assert len(some.points) == len(set(which)) == 300 and distances.max() == 0
+    np.testing.assert_array_equal(some.directions, seeds.directions[which])
+
+
 def test_maps_without_agreement_give_no_seeds(start_taichi, views):
     start_taichi("f32", 2)
     blank = replace(views, edge_maps=np.zeros_like(views.edge_maps))
@@ -128,23 +135,26 @@ def test_suppression_keeps_the_best_of_each_neighbourhood():
 
 def test_directions_follow_a_line_and_lonely_points_get_some_unit_vector():
     line = np.linspace([0.1, 0.2, 0.3], [0.3, 0.4, 0.4], 30)
-    directions = line_directions(np.concatenate([line, [[0.9, 0.9, 0.9]]]), 0.05)
+    points = np.concatenate([line, [[0.9, 0.9, 0.9]]])
+    directions = line_directions(points, points, 0.05)
     unit = np.array([2, 2, 1]) / 3
     assert np.abs(directions[:30] @ unit).min() == pytest.approx(1.0, abs=1e-9)
     assert np.linalg.norm(directions[30]) == pytest.approx(1.0)
 
 
-def test_directions_are_those_of_the_slow_twin(generator):
-    points = generator.random((600, 3)) * [1, 1, 0.2]
-    directions = line_directions(points, 0.08)
-    for i, near in enumerate(cKDTree(points).query_ball_point(points, 0.08)):
+def test_directions_are_those_of_the_slow_twin(generator, monkeypatch):
+    others = generator.random((600, 3)) * [1, 1, 0.2]
+    points = others[:100]
+    monkeypatch.setattr(voting, "NEIGHBOURHOODS", 30)
+    directions = line_directions(points, others, 0.08)
+    for i, near in enumerate(cKDTree(others).query_ball_point(points, 0.08)):
         if len(near) < 3:
             assert directions[i].tolist() == [1, 0, 0]
             continue
-        spreads, axes = np.linalg.eigh(np.cov(points[near].T))
+        spreads, axes = np.linalg.eigh(np.cov(others[near].T))
         if spreads[2] > 1.01 * spreads[1]:  # else any direction between the two will do
             assert abs(axes[:, 2] @ directions[i]) == pytest.approx(1.0, abs=1e-6)
-    assert line_directions(np.zeros((0, 3)), 0.08).shape == (0, 3)
+    assert line_directions(np.zeros((0, 3)), np.zeros((0, 3)), 0.08).shape == (0, 3)
 
 
 def test_nearly_best_is_what_a_dense_grid_gives(generator):

@@ -10,7 +10,6 @@ import taichi as ti
 from taichi_edges.cameras import NEAR
 from taichi_edges.kernels.device import download, upload
 from taichi_edges.kernels.points import (
-    BLOCK,
     F32_1D,
     F32_2D,
     F32_3D,
@@ -19,6 +18,8 @@ from taichi_edges.kernels.points import (
     I32_3D,
     U8_3D,
     U32_2D,
+    WORD,
+    blocks_of,
     load_camera,
     load_point,
     nearest_pixel,
@@ -39,7 +40,7 @@ class Evidence:
         count = len(points)
         per_view = 4 * (views.height * views.width + count)
         size = min(max(BATCH_BYTES // per_view, 1), len(views))
-        self.points = upload(points)
+        self.points, words = upload(points), -(-count // WORD)
         self.claims = upload(np.zeros((size, views.height, views.width), np.int32))
         self.pixels = upload(np.zeros((size, count), np.int32))
         self.claimed = 0  # how often the points have claimed their pixels in `claims`
@@ -50,8 +51,8 @@ class Evidence:
         for first in range(0, len(views), size):
             batch = slice(first, first + size)
             cameras, edge_maps = upload(projections[batch]), upload(views.edge_maps[batch])
-            on_edge = upload(np.zeros((len(projections[batch]), -(-count // BLOCK)), np.uint32))
-            look_up(self.points, cameras, edge_maps, level, total, seen, on_edge)
+            on_edge = upload(np.zeros((len(projections[batch]), words), np.uint32))
+            look_up(words, self.points, cameras, edge_maps, level, total, seen, on_edge)
             self.batches.append((cameras, on_edge))
         self.seen = np.maximum(download(seen), 1)
         self.strength = download(total).astype(np.float64) / self.seen / 255.0
@@ -66,20 +67,12 @@ class Evidence:
         ranks = np.empty_like(weakest_first)
         ranks[weakest_first] = np.arange(count, dtype=np.int32)
         weakest_first, ranks, supported = upload(weakest_first), upload(ranks), upload(np.zeros(count, np.int32))
+        blocks = blocks_of(self.points)
         for cameras, on_edge in self.batches:
             offset = self._next_offset(count)
-            claim_pixels(self.points, cameras, on_edge, ranks, offset, self.claims, self.pixels)
-            count_support(
-                self.points,
-                weakest_first,
-                offset,
-                cameras.shape[0],
-                self.claims,
-                self.pixels,
-                claim_px,
-                reach,
-                supported,
-            )
+            claim_pixels(*blocks, self.points, cameras, on_edge, ranks, offset, self.claims, self.pixels)
+            claimed = (weakest_first, offset, self.claims, self.pixels)
+            count_support(*blocks, cameras.shape[0], self.points, *claimed, claim_px, reach, supported)
         return download(supported) / self.seen
 
     def _next_offset(self, count):
@@ -93,25 +86,32 @@ class Evidence:
 
 @ti.kernel
 def look_up(
-    points: F32_2D, projections: F32_3D, maps: U8_3D, level: ti.i32, total: F32_1D, seen: I32_1D, on_edge: U32_2D
+    words: ti.i32,
+    points: F32_2D,
+    projections: F32_3D,
+    maps: U8_3D,
+    level: ti.i32,
+    total: F32_1D,
+    seen: I32_1D,
+    on_edge: U32_2D,
 ):
     """What the (b, H, W) maps show where the points project to.
 
     Adds the bilinear map values (0..255) to `total` (n,), and the views that have a point in the image to `seen` (n,).
-    on_edge (b, ceil(n / BLOCK)): bit k of word w says whether the pixel of point BLOCK w + k is at least `level`.
+    on_edge (b, words): bit k of word w says whether the pixel of point WORD w + k is at least `level`.
     """
     last_row, last_column = maps.shape[1] - 1, maps.shape[2] - 1
-    for block in range((points.shape[0] + BLOCK - 1) // BLOCK):
+    for word in range(words):
         for view in range(projections.shape[0]):
             camera = load_camera(projections, view)
             bits = ti.u32(0)
-            for i in range(block * BLOCK, ti.min((block + 1) * BLOCK, points.shape[0])):
+            for i in range(word * WORD, ti.min((word + 1) * WORD, points.shape[0])):
                 h = camera @ load_point(points, i)
                 if h[2] > NEAR:
                     row, column = nearest_pixel(h)
                     if row >= 0 and row <= last_row and column >= 0 and column <= last_column:
                         if maps[view, row, column] >= level:
-                            bits |= ti.u32(1) << ti.cast(i - block * BLOCK, ti.u32)
+                            bits |= ti.u32(1) << ti.cast(i - word * WORD, ti.u32)
                         u, v = ti.math.clamp(h[0] / h[2], 0, last_column), ti.math.clamp(h[1] / h[2], 0, last_row)
                         left, above = ti.cast(u, ti.i32), ti.cast(v, ti.i32)
                         right, below = ti.min(left + 1, last_column), ti.min(above + 1, last_row)
@@ -119,11 +119,13 @@ def look_up(
                         lower = ti.math.mix(maps[view, below, left], maps[view, below, right], u - left)
                         total[i] = total[i] + ti.math.mix(upper, lower, v - above)  # += would be atomic
                         seen[i] = seen[i] + 1
-            on_edge[view, block] = bits
+            on_edge[view, word] = bits
 
 
 @ti.kernel
 def claim_pixels(
+    size: ti.i32,
+    blocks: ti.i32,
     points: F32_2D,
     projections: F32_3D,
     on_edge: U32_2D,
@@ -137,48 +139,46 @@ def claim_pixels(
     pixels (at least b, n): row * W + column of the points on edge pixels (see `look_up`), -1 of the others.
     """
     height, width = claims.shape[1], claims.shape[2]
-    blocks = on_edge.shape[1]
     for item in range(projections.shape[0] * blocks):
         view = item // blocks
         block = item - view * blocks
         camera = load_camera(projections, view)
-        bits = on_edge[view, block]
-        for i in range(block * BLOCK, ti.min((block + 1) * BLOCK, points.shape[0])):
+        for i in range(block * size, ti.min((block + 1) * size, points.shape[0])):
             pixel = -1
             h = camera @ load_point(points, i)
             if h[2] > NEAR:
                 row, column = nearest_pixel(h)
                 if row >= 0 and row < height and column >= 0 and column < width:
                     ti.atomic_max(claims[view, row, column], offset + ranks[i])
-                    if bits & ti.u32(1):
+                    if on_edge[view, i // WORD] >> ti.cast(i % WORD, ti.u32) & ti.u32(1):
                         pixel = row * width + column
             pixels[view, i] = pixel
-            bits >>= 1
 
 
 @ti.kernel
 def count_support(
+    size: ti.i32,
+    blocks: ti.i32,
+    views: ti.i32,
     points: F32_2D,
     weakest_first: I32_1D,
     offset: ti.i32,
-    views: ti.i32,
     claims: I32_3D,
     pixels: I32_2D,
     radius: ti.f32,
     reach: ti.f32,
     supported: I32_1D,
 ):
-    """Adds to `supported` (n,) in how many of the first `views` images a point's pixel is owned by one beside it.
+    """Adds to `supported` (n,) in how many of the first `views` images a point's pixel is owned by a point beside it.
 
     The owner is the highest claim within `radius` pixels; beside is within `reach` in 3D. Only `pixels` >= 0 count.
     """
     height, width = claims.shape[1], claims.shape[2]
     margin = ti.cast(radius, ti.i32)
-    blocks = (points.shape[0] + BLOCK - 1) // BLOCK
     for item in range(views * blocks):
         view = item // blocks
         block = item - view * blocks
-        for i in range(block * BLOCK, ti.min((block + 1) * BLOCK, points.shape[0])):
+        for i in range(block * size, ti.min((block + 1) * size, points.shape[0])):
             pixel = pixels[view, i]
             if pixel >= 0:
                 row = pixel // width

@@ -2,12 +2,22 @@
 
 import taichi as ti
 
-BLOCK = 32  # points that are worked on together, one bit each in a word
+WORD = 32  # points in a word that holds one bit of each
 
 F32_1D, F32_2D = ti.types.ndarray(dtype=ti.f32, ndim=1), ti.types.ndarray(dtype=ti.f32, ndim=2)
 F32_3D, U8_3D = ti.types.ndarray(dtype=ti.f32, ndim=3), ti.types.ndarray(dtype=ti.u8, ndim=3)
 I32_1D, I32_2D = ti.types.ndarray(dtype=ti.i32, ndim=1), ti.types.ndarray(dtype=ti.i32, ndim=2)
 I32_3D, U32_2D = ti.types.ndarray(dtype=ti.i32, ndim=3), ti.types.ndarray(dtype=ti.u32, ndim=2)
+
+
+def blocks_of(points):
+    """How kernels divide the n points of an array: (points of a block, number of blocks), their first arguments.
+
+    On a CPU a camera is loaded once for a whole block; on a GPU every point has a thread of its own. An argument, and
+    not calculated from the shape in the kernel, because Taichi does not compile such loops for Vulkan.
+    """
+    size = WORD if ti.lang.impl.current_cfg().arch == ti.cpu else 1
+    return size, -(-points.shape[0] // size)
 
 
 @ti.func

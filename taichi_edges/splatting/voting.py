@@ -2,22 +2,22 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 import taichi as ti
-from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
 from taichi_edges.kernels import device
 from taichi_edges.kernels.points import (
-    BLOCK,
     F32_1D,
     F32_2D,
     F32_3D,
     I32_1D,
     I32_2D,
     U8_3D,
+    blocks_of,
     load_camera,
     load_point,
     nearest_pixel,
@@ -34,8 +34,9 @@ KEEP = 0.2  # share of the views that must see an edge in a cell; hidden and fai
 CHANCE_POINTS, CHANCE_QUANTILE = 20_000, 0.97  # a seed scores higher than this share of random points in the box
 SUPPRESS_PX = 3.3  # a seed is the best, or nearly, within this many pixels at the median depth
 NEARLY = 0.8
+ALONG_PX, NEIGHBOURHOODS = 8, 2048  # radius that tells a seed's direction; how many are looked at together
 LEAST_SUPPORT = 0.05  # share of the views whose edge pixels are a seed's own (see `exclusive_support`)
-BATCH_BYTES = 256 << 20  # distance maps that are kept at the same time
+BATCH_BYTES = 512 << 20  # distance maps that are kept at the same time
 CHUNK = 1 << 21  # points that are scored at the same time
 EIGHTHS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], np.int32)  # of a cell of size 2
 AROUND = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)])
@@ -105,6 +106,8 @@ def distance_at(distances: ti.template(), view, h):
 
 @ti.kernel
 def count_near(
+    size: ti.i32,
+    blocks: ti.i32,
     view: ti.i32,
     cells: I32_2D,
     split: ti.i32,
@@ -120,10 +123,9 @@ def count_near(
     cells: (n, 3) integer coordinates, which `projections` take. split: 0, or 1 where 8 cells in turn are the eighths of
     one in `cells`. later: views after this one. Cells with `needed` views, or past getting them, are left alone.
     """
-    count = near.shape[0]
-    for block in range((count + BLOCK - 1) // BLOCK):
+    for block in range(blocks):
         camera = load_camera(projections, view)
-        for i in range(block * BLOCK, ti.min((block + 1) * BLOCK, count)):
+        for i in range(block * size, ti.min((block + 1) * size, near.shape[0])):
             if near[i] < needed and near[i] + later + 1 >= needed:
                 parent = i >> (3 * split)
                 cell = ti.Vector([(cells[parent, axis] << split) + (i >> (2 - axis) & split) for axis in range(3)])
@@ -134,25 +136,40 @@ def count_near(
 
 
 @ti.kernel
-def add_scores(view: ti.i32, points: F32_2D, projections: F32_3D, distances: U8_3D, falloff: F32_1D, scores: F32_1D):
+def add_scores(
+    size: ti.i32,
+    blocks: ti.i32,
+    view: ti.i32,
+    points: F32_2D,
+    projections: F32_3D,
+    distances: U8_3D,
+    falloff: F32_1D,
+    scores: F32_1D,
+):
     """Adds the `falloff` at the distances where the points (n, 3) project to in one view of a batch."""
-    for block in range((points.shape[0] + BLOCK - 1) // BLOCK):
+    for block in range(blocks):
         camera = load_camera(projections, view)
-        for i in range(block * BLOCK, ti.min((block + 1) * BLOCK, points.shape[0])):
+        for i in range(block * size, ti.min((block + 1) * size, points.shape[0])):
             distance = distance_at(distances, view, camera @ load_point(points, i))
             if distance >= 0:
                 scores[i] = scores[i] + falloff[distance]
 
 
-def vote_seeds(views, threshold, generator):
-    """Seeds of the whole scene box. ti.init must have been called. generator: jitters the finest cells."""
+def vote_seeds(views, threshold, generator, most=None):
+    """Seeds of the whole scene box, at most so many, drawn at random. ti.init must have been called.
+
+    threshold: of full scale. generator: jitters the finest cells, and draws.
+    """
     pixel = pixel_size(views)
     distances = DistanceBatches(views.edge_maps, threshold)
     cells, size = vote_cells(views, distances, pixel)
     points, scores = score_cells(views, distances, cells, size, generator)
     points = points[nearly_best(points, scores, SUPPRESS_PX * pixel)]
     points = points[exclusive_support(views, points, threshold) >= LEAST_SUPPORT]
-    return Seeds(points, line_directions(points, 8 * pixel), pixel)
+    chosen = points
+    if most is not None and len(points) > most:
+        chosen = points[np.sort(generator.choice(len(points), most, replace=False))]
+    return Seeds(chosen, line_directions(chosen, points, ALONG_PX * pixel), pixel)
 
 
 def vote_cells(views, distances, pixel):
@@ -193,7 +210,7 @@ def see_edges(views, distances, cells, split, size):
         cameras = device.upload(projections[batch])
         for view in range(batch.stop - batch.start):
             later = len(views) - 1 - batch.start - view
-            count_near(view, cells, split, cameras, maps, radius, later, needed, near)
+            count_near(*blocks_of(near), view, cells, split, cameras, maps, radius, later, needed, near)
     return device.download(near) >= needed
 
 
@@ -220,7 +237,7 @@ def mean_scores(views, distances, points):
     for batch, maps in distances:
         cameras = device.upload(projections[batch])
         for view in range(batch.stop - batch.start):
-            add_scores(view, points, cameras, maps, falloff, scores)
+            add_scores(*blocks_of(points), view, points, cameras, maps, falloff, scores)
     return device.download(scores) / np.float32(len(views))
 
 
@@ -245,21 +262,26 @@ def nearly_best(points, scores, radius):
     return scores >= NEARLY * around[cell]
 
 
-def line_directions(points, radius):
-    """(n, 3) unit vectors: the first principal axis of each point's neighbours within `radius`."""
-    count = len(points)
-    if count == 0:
-        return np.zeros((0, 3))
-    pairs = cKDTree(points).query_pairs(radius, output_type="ndarray").astype(np.int32)
-    near = coo_array((np.ones(len(pairs), np.float32), pairs.T), shape=(count, count)).tocsr()
+def line_directions(points, others, radius):
+    """(n, 3) unit vectors: the first principal axis of those of the `others` that lie within `radius` of each point."""
+    tree = cKDTree(others)
+    directions = np.tile([1.0, 0.0, 0.0], (len(points), 1))
     rows, columns = np.triu_indices(3)
-    offsets = points - points.mean(axis=0)
-    moments = np.concatenate([np.ones((count, 1)), offsets, offsets[:, rows] * offsets[:, columns]], axis=1)
-    moments = moments + near @ moments + near.T @ moments  # each pair stands there once
-    neighbours, means = moments[:, 0], moments[:, 1:4] / moments[:, :1]
-    covariances = np.empty((count, 3, 3))
-    spread = moments[:, 4:] / moments[:, :1] - means[:, rows] * means[:, columns]
-    covariances[:, rows, columns] = covariances[:, columns, rows] = spread
-    directions = np.linalg.eigh(covariances)[1][:, :, 2]
-    directions[neighbours < 3] = [1.0, 0.0, 0.0]
+    for first in range(0, len(points), NEIGHBOURHOODS):
+        some = points[first : first + NEIGHBOURHOODS]
+        pairs = cKDTree(some).sparse_distance_matrix(tree, radius, output_type="ndarray")
+        of, offsets = pairs["i"], others[pairs["j"]] - some[pairs["i"]]
+        counts = np.bincount(of, minlength=len(some))
+        mean_over = partial(_mean_by, of, np.maximum(counts, 1))
+        means, products = mean_over(offsets), mean_over(offsets[:, rows] * offsets[:, columns])
+        covariances = np.empty((len(some), 3, 3))
+        spreads = products - means[:, rows] * means[:, columns]
+        covariances[:, rows, columns] = covariances[:, columns, rows] = spreads
+        axes = np.linalg.eigh(covariances)[1][:, :, 2]
+        directions[first : first + NEIGHBOURHOODS][counts >= 3] = axes[counts >= 3]
     return directions
+
+
+def _mean_by(group, counts, values):
+    """(g, m) means of the rows of `values` (n, m) by their `group` (n,), of which `counts` (g,) rows each belong to."""
+    return np.stack([np.bincount(group, column, len(counts)) for column in values.T], axis=1) / counts[:, None]
