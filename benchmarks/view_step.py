@@ -15,9 +15,9 @@ import numpy as np
 import taichi as ti
 
 from benchmarks.machine import benchmark_cache
+from taichi_edges.kernels.device import start_taichi
 from taichi_edges.splatting.gaussians import Gaussians
 from taichi_edges.splatting.splatter import GPU_ARCHS, Splatter
-from taichi_edges.splatting.training import start_taichi
 
 PROFILED = ("cpu", "cuda")  # the devices whose kernels Taichi's profiler measures
 RATES = (1e-12, 1e-12, 1e-12, 1e-12)  # Adam does all its work, and the Gaussians stay where they are

@@ -99,9 +99,9 @@ class Run:
 
     @property
     def kernel_cache(self):
-        """Where compiled Taichi kernels are kept between runs."""
+        """Where compiled Taichi kernels are kept between runs: a folder of our own for each pair of versions."""
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        return home / "taichi_edges" / f"kernels-{taichi_edges.__version__}"
+        return home / "taichi_edges" / f"kernels-{taichi_edges.__version__}-taichi-{version('taichi')}"
 
     def data_path(self, text, key):
         """A path of the scene: absolute, or relative to the data root. UserError where it does not exist."""

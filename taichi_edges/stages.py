@@ -6,7 +6,6 @@ run cannot differ from an unbroken one. What takes long to import (SciPy, OpenCV
 stage that needs it: a run that is up to date, and a mistake in the scene file, shall not wait for it.
 """
 
-import contextlib
 import csv
 import io
 import json
@@ -102,12 +101,12 @@ def _prepare_synthetic(run):
 def train(run):
     """`views.npz` -> `gaussians.ply` (input frame) and `train_log.csv`."""
     from taichi_edges.exporters.splats import write_gaussians
-    from taichi_edges.splatting.training import Training, start_taichi
+    from taichi_edges.kernels.device import start_taichi
+    from taichi_edges.splatting.training import Training
 
     config, views = run.config.train, read_views(run.path("views.npz"))
     generator = np.random.default_rng(run.config.seed)
-    with contextlib.redirect_stdout(io.StringIO()):  # ti.init announces itself with a bare print
-        start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)
+    start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)
     start = _start(run, views, generator)
     training = Training(views, config, generator, run.threads, run.arch)
     gaussians, records = training.run(start, run.progress)
@@ -130,15 +129,18 @@ def _start(run, views, generator):
     """The Gaussians that training starts from, as `train.seeds` says."""
     from taichi_edges.exporters.ply import read_vertices, stack_fields
     from taichi_edges.splatting.gaussians import start_gaussians
-    from taichi_edges.splatting.seeding import given_points, random_points, voted_gaussians
+    from taichi_edges.splatting.seeding import LEAST_VOTED, given_points, random_points, voted_gaussians
 
     config = run.config.train
-    if config.seeds == "votes":
+    seeds = config.seeds
+    if seeds == "votes":
         voted = voted_gaussians(views, config.edge_threshold, config.gaussians, config.initial_opacity, generator)
         if voted is not None:
             return voted
-        run.progress.warn("too few places where the views agree on an edge; the training starts from random points")
-    if config.seeds == "points":
+        seeds, instead = ("points", "source.points") if run.config.source.points else ("random", "random points")
+        found = f"the views agree on an edge in fewer than {LEAST_VOTED} places"
+        run.progress.warn(f"{found}; the training starts from {instead} instead")
+    if seeds == "points":
         given = stack_fields(read_vertices(run.path("seeds.ply"), ("x", "y", "z")), ("x", "y", "z"))
         points = given_points(views.similarity.to_unit(given.astype(np.float64)), config.gaussians, generator)
     else:
@@ -165,8 +167,11 @@ def cluster(run):
     from taichi_edges.edges.segmentation import split_clusters
     from taichi_edges.exporters.point_cloud import write_oriented_points
     from taichi_edges.exporters.splats import read_gaussians
+    from taichi_edges.kernels.device import is_running, start_taichi
     from taichi_edges.splatting.gaussians import Gaussians
 
+    if not is_running(run.arch, run.threads):  # after the training it is
+        start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)
     views = read_views(run.path("views.npz"))
     gaussians = Gaussians(*read_gaussians(run.path("gaussians.ply")))
     means = views.similarity.to_unit(gaussians.means.astype(np.float64))

@@ -1,14 +1,21 @@
-"""What the edge maps say for and against single 3D points: strength, width, and support that is not shared."""
+"""What the edge maps say for and against single 3D points: strength, width, and support that is not shared.
+
+Strength and support are computed by Taichi (imported where it is used): ti.init must have been called.
+"""
+
+import weakref
 
 import cv2
 import numpy as np
-from scipy.ndimage import map_coordinates
 
-from taichi_edges.cameras import NEAR, inside_image
+from taichi_edges.cameras import NEAR
 
 OWNER_ROUNDS = 4  # owners whose own support turns out weak lose their pixels in the next round
 CLAIM = 0.8  # a point claims the pixels within this many line widths of its projection
 SAME_EDGE = 2.5  # a pixel supports the points within this many line widths (in 3D) of its owner
+WIDTH_VIEWS = 64  # the width of the lines is measured in so many views at most
+
+_widths = {}  # (id of Views, threshold): line width in pixels; an entry goes with its Views
 
 
 def edge_strength(views, points):
@@ -16,38 +23,45 @@ def edge_strength(views, points):
 
     Over the views that have the point in front of the camera and inside the image; bilinear; 0 where there is none.
     """
-    total = np.zeros(len(points))
-    seen = np.zeros(len(points), np.int32)
-    for view in range(len(views)):
-        pixels, _ = views.project(points, view)
-        inside = inside_image(pixels, views.width, views.height)
-        rows_first = pixels[inside][:, ::-1].T
-        total[inside] += map_coordinates(views.edge_maps[view], rows_first, np.float64, order=1, mode="nearest")
-        seen += inside
-    return total / np.maximum(seen, 1) / 255.0
+    from taichi_edges.kernels.evidence import Evidence
+
+    strength = np.zeros(len(points))
+    points, finite = _finite(points)
+    if len(points):
+        strength[finite] = Evidence(views, points, 0.5).strength
+    return strength
 
 
 def line_width(views, threshold):
     """Typical width of the lines in the edge maps: pixels, and unit-cube units at the middle of the scene box.
 
-    threshold: of full scale. Inside a band of w pixels the distance from a pixel's centre to that of the nearest pixel
-    outside is (w + 2) / 4 on average.
+    threshold: of full scale. Measured once for each Views.
+    """
+    key = (id(views), threshold)
+    if key not in _widths:
+        _widths[key] = _measure_width(views.edge_maps[:: -(-len(views) // WIDTH_VIEWS)], threshold)
+        weakref.finalize(views, _widths.pop, key, None)
+    return _widths[key], _widths[key] * pixel_size(views)
+
+
+def _measure_width(edge_maps, threshold):
+    """Pixels. Inside a band of w pixels the distance from a pixel's centre to that of the nearest pixel outside is
+    (w + 2) / 4 on average.
     """
     distances, pixels = 0.0, 0
-    for edge_map in views.edge_maps:
+    for edge_map in edge_maps:
         edges = (edge_map >= threshold * 255).astype(np.uint8)
         if edges.all():  # no line, and no distance to measure
             continue
         distances += float(cv2.distanceTransform(edges, cv2.DIST_L2, 5).sum())
         pixels += int(edges.sum())
-    width = max(4.0 * distances / max(pixels, 1) - 2.0, 1.0)
-    return float(width), float(width * pixel_size(views))
+    return max(4.0 * distances / max(pixels, 1) - 2.0, 1.0)
 
 
 def pixel_size(views):
     """Size of a pixel at the middle of the scene box, unit-cube units: median over the views."""
-    middle = views.box.mean(axis=0, keepdims=True)
-    depths = np.array([views.project(middle, view)[1][0] for view in range(len(views))])
+    forward, offset = views.world_to_camera[:, 2, :3], views.world_to_camera[:, 2, 3]
+    depths = forward @ views.box.mean(axis=0) + offset
     in_front = np.maximum(depths, NEAR)  # a view that looks away says nothing about the scale
     return float(np.median(in_front / views.intrinsics[:, 0, 0]))
 
@@ -61,39 +75,23 @@ def exclusive_support(views, points, threshold):
     from those views. Strength is the mean map value first, then the support found in the round before.
     Returns (n,) in 0..1, relative to the views that have the point in front of the camera and inside the image.
     """
-    width_px, width = line_width(views, threshold)
-    strength = edge_strength(views, points)
-    support = strength
-    for _ in range(OWNER_ROUNDS):
-        support = _owned_share(views, points, support + 1e-3 * strength, threshold, CLAIM * width_px, SAME_EDGE * width)
+    from taichi_edges.kernels.evidence import Evidence
+
+    support = np.zeros(len(points))
+    points, finite = _finite(points)
+    if len(points):
+        width_px, width = line_width(views, threshold)
+        evidence = Evidence(views, points, threshold)
+        owned = evidence.strength
+        for _ in range(OWNER_ROUNDS):
+            owned = evidence.owned_share(owned + 1e-3 * evidence.strength, CLAIM * width_px, SAME_EDGE * width)
+        support[finite] = owned
     return support
 
 
-def _owned_share(views, points, strength, threshold, claim_px, reach):
-    """One round of `exclusive_support`."""
-    supported = np.zeros(len(points))
-    seen = np.zeros(len(points), np.int32)
-    weakest_first = np.argsort(strength, kind="stable")
-    for view in range(len(views)):
-        pixels, _ = views.project(points, view)
-        inside = inside_image(pixels, views.width, views.height)
-        seen += inside
-        here = weakest_first[inside[weakest_first]]
-        columns, rows = np.rint(pixels[here]).astype(np.int64).T
-        owner = _owners(here, rows, columns, views.height, views.width, claim_px)[rows, columns]
-        on_edge = views.edge_maps[view, rows, columns] >= threshold * 255
-        beside = np.linalg.norm(points[owner] - points[here], axis=1) <= reach
-        supported[here] += on_edge & beside
-    return supported / np.maximum(seen, 1)
-
-
-def _owners(points, rows, columns, height, width, radius):
-    """(H, W) index of the last of `points` whose pixel lies within `radius` pixels; later points overwrite earlier."""
-    margin = int(np.ceil(radius))
-    across = np.arange(-margin, margin + 1)
-    down, right = (grid.ravel() for grid in np.meshgrid(across, across, indexing="ij"))
-    disc = down**2 + right**2 <= radius**2
-    owners = np.full((height + 2 * margin, width + 2 * margin), -1)
-    targets = (rows[:, None] + down[disc] + margin, columns[:, None] + right[disc] + margin)
-    owners[targets] = points[:, None]  # NumPy assigns in order, so the strongest, which come last, stay
-    return owners[margin : margin + height, margin : margin + width]
+def _finite(points):
+    """Those of the (n, 3) points that are finite numbers, as float32, and which they are, (n,) bool."""
+    with np.errstate(over="ignore"):
+        points = np.asarray(points, np.float32)
+    finite = np.isfinite(points).all(axis=1)
+    return points[finite], finite

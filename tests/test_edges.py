@@ -570,6 +570,11 @@ def points_on_column(count, column=16, depth=2.0):
     )
 
 
+@pytest.fixture
+def taichi(start_taichi):
+    start_taichi("f32", 2)
+
+
 def filtered(points, opacities=None, **config):
     """filter_points with directions that carry the points' numbers."""
     opacities = np.ones(len(points)) if opacities is None else opacities
@@ -582,20 +587,20 @@ def filtered(points, opacities=None, **config):
     return kept[:, 0].astype(int).tolist(), counts
 
 
-def test_transparent_gaussians_are_left_out():
+def test_transparent_gaussians_are_left_out(taichi):
     opacities = np.array([0.9, 0.19, 0.2, 0.0])
     kept, counts = filtered(points_on_column(4), opacities, min_opacity=0.2)
     assert kept == [0, 2] and counts.low_opacity == 2
 
 
-def test_points_off_the_edges_behind_the_cameras_and_outside_the_images_have_no_support():
+def test_points_off_the_edges_behind_the_cameras_and_outside_the_images_have_no_support(taichi):
     on_edge, off_edge = points_on_column(1)[0], points_on_column(1, column=5)[0]
     behind, outside = -on_edge, points_on_column(1, column=200)[0]
     kept, counts = filtered(np.stack([on_edge, off_edge, behind, outside]), min_support=0.0)
     assert kept == [0] and counts.low_support == 3
 
 
-def test_support_counts_only_the_views_that_see_a_point():
+def test_support_counts_only_the_views_that_see_a_point(taichi):
     views = four_views()
     away = views.world_to_camera.copy()
     away[3] = np.diag([-1.0, 1, -1, 1])[:3]  # the last camera looks the other way
@@ -605,7 +610,7 @@ def test_support_counts_only_the_views_that_see_a_point():
     assert len(filter_points(points, points, np.ones(3), views, settings, 0.5)[0]) == 3
 
 
-def test_support_is_a_share_of_the_views():
+def test_support_is_a_share_of_the_views(taichi):
     views = four_views()
     maps = views.edge_maps.copy()
     maps[1:] = 0  # an edge in one view of four
@@ -626,6 +631,6 @@ def test_too_few_points_have_no_outliers(generator):
     np.testing.assert_array_equal(statistical_inliers(generator.random((5, 3)), 10, 1.0), np.arange(5))
 
 
-def test_nothing_left_is_no_error():
+def test_nothing_left_is_no_error(taichi):
     kept, counts = filtered(points_on_column(5), np.zeros(5))
     assert kept == [] and counts.low_opacity == 5

@@ -56,7 +56,8 @@ def test_faint_gaussians_are_culled_with_their_moments(generator):
     assert_kept(cull_opacity(numbered_population(generator.random((5, 3)), opacities), 0.05), [0, 2, 4])
 
 
-def test_gaussians_off_the_edges_are_culled_with_their_moments(block, generator):
+def test_gaussians_off_the_edges_are_culled_with_their_moments(start_taichi, block, generator):
+    start_taichi("f32", 2)
     views, edges = block
     on = edges[:: len(edges) // 30]
     off = generator.random((60, 3))

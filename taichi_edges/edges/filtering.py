@@ -23,7 +23,7 @@ def filter_points(means, directions, opacities, views, config, edge_threshold):
     means: (n, 3) unit cube. directions: (n, 3) unit vectors. opacities: (n,). config: the scene's `filter` section.
     Support counts, among the views that have the point in front of the camera (z > 0) and inside the image, those in
     which it falls on an edge pixel that is not explained by a better point elsewhere (`exclusive_support`); that an
-    edge is hidden in many views is why the share asked for is small.
+    edge is hidden in many views is why the share asked for is small. ti.init must have been called.
     Returns points (m, 3) float64, directions (m, 3) float64 and FilterCounts.
     """
     points = np.asarray(means, dtype=np.float64)

@@ -36,7 +36,10 @@ def cull_opacity(population, minimum):
 
 
 def cull_support(population, views, minimum, threshold):
-    """Those that the edge maps support in at least this share of the views, shared support not counted twice."""
+    """Those that the edge maps support in at least this share of the views, shared support not counted twice.
+
+    views: Views. threshold: of full scale. ti.init must have been called.
+    """
     means = population.gaussians.means.astype(np.float64)
     return population.keep(exclusive_support(views, means, threshold) >= minimum)
 

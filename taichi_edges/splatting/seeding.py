@@ -27,11 +27,8 @@ def voted_gaussians(views, edge_threshold, count, opacity, generator):
 
     ti.init must have been called. edge_threshold: of full scale. opacity: 0..1.
     """
-    seeds = vote_seeds(views, edge_threshold, generator)
-    if len(seeds.points) < LEAST_VOTED:
+    seeds = vote_seeds(views, edge_threshold, generator, count)
+    if len(seeds.points) < min(LEAST_VOTED, count):
         return None
-    chosen = np.arange(len(seeds.points))
-    if len(chosen) > count:
-        chosen = np.sort(generator.choice(len(chosen), count, replace=False))
     along, across = ALONG_PX * seeds.pixel, ACROSS_PX * seeds.pixel
-    return orient_gaussians(seeds.points[chosen], seeds.directions[chosen], along, across, opacity)
+    return orient_gaussians(seeds.points, seeds.directions, along, across, opacity)

@@ -1,12 +1,10 @@
 """Training: the paper's schedule (3.1, 3.2 and supplement) over the view steps of a scene."""
 
-import gc
 import time
 from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 
 from taichi_edges.errors import UserError
 from taichi_edges.splatting import density
@@ -26,27 +24,6 @@ class LogRecord:
     seconds: float
     loss: float
     gaussians: int
-
-
-def start_taichi(arch, threads, seed, cache):
-    """ti.init for this project: f32, quiet, kernels cached in the folder `cache`.
-
-    arch: 'cpu', 'cuda' or 'vulkan'. UserError where the machine does not have it.
-    """
-    gc.collect()  # an ndarray of an earlier program that is freed later would take memory of the new one with it
-    available = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
-    ti.init(
-        arch=available[arch],
-        default_fp=ti.f32,
-        cpu_max_num_threads=threads,
-        random_seed=seed,
-        offline_cache=True,
-        offline_cache_file_path=str(cache),
-        log_level=ti.ERROR,
-    )
-    in_use = ti.lang.impl.current_cfg().arch
-    if arch != "cpu" and in_use != available[arch]:
-        raise UserError(f"--arch {arch}: this machine offers Taichi no {arch} device; use --arch cpu")
 
 
 def rates(config, share):

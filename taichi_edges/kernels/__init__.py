@@ -1,0 +1,5 @@
+"""Taichi outside the splatting: arrays on the device, points in cameras, and what edge maps say about points."""
+
+import os
+
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when Taichi is imported: no version line on stdout

@@ -1,0 +1,78 @@
+"""The device that Taichi runs on, and arrays on their way there: a CPU works on NumPy's own memory, a GPU on copies."""
+
+import contextlib
+import gc
+import io
+import time
+from pathlib import Path
+
+import numpy as np
+import taichi as ti
+
+from taichi_edges.errors import UserError
+
+STALE_LOCK = 60.0  # seconds; Taichi holds the lock of its kernel cache for some milliseconds
+
+
+def start_taichi(arch, threads, seed, cache):
+    """ti.init for this project: f32, quiet, kernels cached in the folder `cache`.
+
+    What an earlier program held on the device is freed. arch: 'cpu', 'cuda' or 'vulkan'. UserError where the machine
+    does not have it.
+    """
+    gc.collect()  # an ndarray of an earlier program that is freed later would take memory of the new one with it
+    release_cache(Path(cache))
+    available = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
+    with contextlib.redirect_stdout(io.StringIO()):  # ti.init announces itself with a bare print
+        ti.init(
+            arch=available[arch],
+            default_fp=ti.f32,
+            cpu_max_num_threads=threads,
+            random_seed=seed,
+            offline_cache=True,
+            offline_cache_file_path=str(cache),
+            log_level=ti.ERROR,
+        )
+    in_use = ti.lang.impl.current_cfg().arch
+    if arch != "cpu" and in_use != available[arch]:
+        raise UserError(f"--arch {arch}: this machine offers Taichi no {arch} device; use --arch cpu")
+
+
+def release_cache(cache):
+    """Remove the lock that a killed process has left in the kernel cache: with it nothing is read from there again.
+
+    Processes that run at the same time take turns by that lock; one held for STALE_LOCK is nobody's.
+    """
+    lock = cache / "ticache.lock"
+    with contextlib.suppress(OSError):
+        if time.time() - lock.stat().st_mtime > STALE_LOCK:
+            lock.unlink()
+
+
+def is_running(arch, threads):
+    """Whether Taichi runs on this arch ('cpu', 'cuda' or 'vulkan') with this number of CPU threads, and in f32."""
+    if ti.lang.impl.get_runtime().prog is None:
+        return False
+    running = ti.lang.impl.current_cfg()
+    wanted = (getattr(ti, arch), threads, ti.f32)
+    return (running.arch, running.cpu_max_num_threads, running.default_fp) == wanted
+
+
+def threads():
+    """The number of CPU threads Taichi was started with."""
+    return ti.lang.impl.current_cfg().cpu_max_num_threads
+
+
+def upload(array):
+    """What kernels take for a NumPy array: on a CPU the array itself, on a GPU a copy in its memory."""
+    array = np.ascontiguousarray(array)
+    if ti.lang.impl.current_cfg().arch == ti.cpu:
+        return array
+    copy = ti.ndarray(ti.lang.util.to_taichi_type(array.dtype), shape=array.shape)
+    copy.from_numpy(array)
+    return copy
+
+
+def download(array):
+    """What kernels have written to the `upload` of an array, as a NumPy array."""
+    return array if isinstance(array, np.ndarray) else array.to_numpy()
