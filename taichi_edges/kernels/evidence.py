@@ -25,7 +25,7 @@ from taichi_edges.kernels.points import (
     nearest_pixel,
 )
 
-BATCH_BYTES = 32 << 20  # images and pixel lists of the views that are worked on together
+BATCH_BYTES = 16 << 20  # images and pixel lists of the views that are worked on together
 LARGEST_I32 = 2**31 - 1
 
 
