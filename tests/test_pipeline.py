@@ -58,6 +58,7 @@ train:
   epochs: 40
   gaussians: 1200
   only_means: 0.375
+  means_decay_every: 0.25
   regularize_from: 0.75
   learning_rates: {means: 0.005, scales: 0.001, quaternions: 0.01}
   density: {duplicate_at: [], cull_opacity_at: [0.625], cull_support_at: [0.75]}
