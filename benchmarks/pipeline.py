@@ -1,4 +1,4 @@
-"""Whole runs: seconds, memory and metrics of every scene file, `python -m benchmarks.pipeline --preset fast paper`.
+"""Whole runs: seconds, memory and metrics of every scene file, `python benchmarks/pipeline.py --preset fast paper`.
 
 Each run is the command a user types, in a process of its own, from the shell to the written exports.
 """
@@ -15,13 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
+if not __package__:  # run as a script: the project's root takes the place of this folder
+    sys.path[0] = str(Path(__file__).resolve().parent.parent)
+
 from benchmarks.machine import available_threads, benchmark_cache, compiled_kernels, machine_line, maxrss_mib
 from benchmarks.markdown import table
 from taichi_edges.errors import UserError
 from taichi_edges.pipeline import STAGES, Run
 from taichi_edges.scene_file import load_scene
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).resolve().parent.parent
 METRICS = {
     "Acc mm": ("accuracy_mm", "{:.2f}"),
     "Comp mm": ("completeness_mm", "{:.2f}"),
@@ -128,7 +131,7 @@ def median(values):
 
 def parse_arguments(arguments=None):
     """The command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.pipeline", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python benchmarks/pipeline.py", description=__doc__.splitlines()[0])
     parser.add_argument("--scene", type=Path, nargs="+", help="scene files (default: all in scenes/)")
     parser.add_argument("--preset", choices=("fast", "paper"), nargs="+", default=[None], help="default: the scene's")
     parser.add_argument("--threads", type=int, default=available_threads())

@@ -1,4 +1,4 @@
-"""How time and memory grow with Gaussians, views and pixels: `python -m benchmarks.scaling`.
+"""How time and memory grow with Gaussians, views and pixels: `python benchmarks/scaling.py`.
 
 Each axis is varied alone from a base point. Every point is a process of its own, so that its peak memory is its own; a
 process that had to compile kernels is repeated, because a compiler's memory is not what is asked for. Processes cannot
@@ -15,6 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+if not __package__:  # run as a script: the project's root takes the place of this folder
+    sys.path[0] = str(Path(__file__).resolve().parent.parent)
+
 from benchmarks.log_plot import Curve, Panel, draw_panels
 from benchmarks.machine import (
     MIB,
@@ -28,9 +31,9 @@ from benchmarks.machine import (
 )
 from benchmarks.markdown import table
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).resolve().parent.parent
 AXES = {"gaussians": "Gaussians", "views": "views", "pixels": "width of a square view, pixels"}
-WARM_UP_STEPS = 2
+ARRAYS = ("maps", "words")  # of EdgeImages
 SEED = 0
 
 
@@ -38,9 +41,9 @@ SEED = 0
 
 
 def measure_here(count, view_count, width, height, threads, repeats):
-    """Time and memory of one point in this process, as a dict. MiB; milliseconds; bytes: of each array of the maps."""
+    """Time and memory of one point in this process, as a dict. MiB; milliseconds per step; bytes of maps, masks."""
     from benchmarks.edge_scene import make_scene, scatter_gaussians
-    from benchmarks.view_step import make_splatter, start, view_step
+    from benchmarks.view_step import ROUND, do_round, make_splatter, start
 
     start("cpu", threads, profile=False)
     begun = memory_mib()
@@ -51,49 +54,35 @@ def measure_here(count, view_count, width, height, threads, repeats):
     built, peaks = memory_mib(), [*peaks, peak_memory_mib()]
     reset_peak_memory()
     splatter.load(scatter_gaussians(scene, count, np.random.default_rng(SEED)))
+    do_round(splatter, 0)
     milliseconds, processor = [], []
-    for number in range(1, WARM_UP_STEPS + repeats + 1):
+    for number in range(1, 1 + repeats):
         started, used = time.perf_counter(), time.process_time()
-        view_step(splatter, number % view_count, number)
-        milliseconds.append((time.perf_counter() - started) * 1e3)
-        processor.append((time.process_time() - used) * 1e3)
+        do_round(splatter, number)
+        milliseconds.append((time.perf_counter() - started) * 1e3 / ROUND)
+        processor.append((time.process_time() - used) * 1e3 / ROUND)
     peaks.append(peak_memory_mib())
-    arrays = array_bytes(splatter.images)
+    arrays = {name: getattr(splatter.images, name) for name in ARRAYS}
+    own = {name: array.nbytes for name, array in arrays.items() if not np.shares_memory(array, scene.edge_maps)}
     return {
-        "milliseconds": float(np.median(milliseconds[WARM_UP_STEPS:])),
-        "processor": float(np.median(processor[WARM_UP_STEPS:])),
+        "milliseconds": float(np.median(milliseconds)),
+        "processor": float(np.median(processor)),
         "begun": begun,  # Python, NumPy, OpenCV and Taichi alone
         "with_maps": with_maps,  # and the maps of the scene
         "built": built,  # and the Splatter
-        "building": peaks[1],  # while it was built
-        "stepping": peaks[2],  # while steps were done
+        "building": peaks[1],  # at most, while it was built
+        "stepping": peaks[2],  # at most, while steps were done
         "peak": max(peaks),
-        "host_maps": scene.edge_maps.nbytes,
-        "arrays": arrays,
-        "edge_images": sum(arrays.values()),
+        "arrays": {"maps of the reader": scene.edge_maps.nbytes} | own,
+        "edge_images": sum(own.values()) + scene.edge_maps.nbytes,
         "edge_pixels": float((scene.edge_maps[:: max(view_count // 50, 1)] > 0).sum(axis=(1, 2)).mean()),
     }
-
-
-def array_bytes(images):
-    """{name: bytes} of the arrays an object holds, on the device or in NumPy."""
-    import taichi as ti
-    from taichi.lang.util import to_numpy_type
-
-    sizes = {}
-    for name, value in vars(images).items():
-        if isinstance(value, ti.Ndarray):
-            scalars = int(np.prod(value.shape)) * int(np.prod(value.element_shape))
-            sizes[name] = scalars * np.dtype(to_numpy_type(value.dtype)).itemsize
-        elif isinstance(value, np.ndarray):
-            sizes[name] = value.nbytes
-    return sizes
 
 
 def measure(point, options):
     """`measure_here` in a new process. point: (Gaussians, views, width, height)."""
     settings = [*point, options.threads, options.repeats]
-    command = [sys.executable, "-m", "benchmarks.scaling", "--point", *map(str, settings)]
+    command = [sys.executable, __file__, "--point", *map(str, settings)]
     for _ in range(2):
         known = compiled_kernels(benchmark_cache())
         done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
@@ -137,7 +126,7 @@ def slope_text(xs, ys):
 
 
 def series(axis, points, found):
-    """{what: (xs, ys)} of one axis: ms per step on the clock and of all threads, peak MiB, MiB of the maps."""
+    """{what: (xs, ys)} of one axis: ms per step on the clock and of all threads, peak MiB, MiB of maps and masks."""
     xs = tuple(position(axis, point) for point in points)
     return {
         "clock": (xs, tuple(found[point]["milliseconds"] for point in points)),
@@ -155,7 +144,7 @@ def draw_curves(path, curves, found):
         exponent = f"processor: exponent {slope_text(*of['processor'])}"
         times = Curve(exponent, *of["processor"]), Curve("on the clock", *of["clock"])
         above.append(Panel("milliseconds per view step", AXES[axis], times))
-        memory = Curve("whole process", *of["peak"]), Curve("edge maps in the Splatter", *of["maps"])
+        memory = Curve("whole process", *of["peak"]), Curve("edge maps and masks", *of["maps"])
         below.append(Panel("peak memory, MiB", AXES[axis], memory))
     draw_panels(path, [above, below])
 
@@ -167,10 +156,10 @@ def print_points(curves, found):
         for point in points:
             of = found[point]
             size = f"{point[2]} x {point[3]}"
-            memory = [f"{value:.0f}" for value in (of["peak"], of["host_maps"] / MIB, of["edge_images"] / MIB)]
+            memory = [f"{value:.0f}" for value in (of["peak"], of["edge_images"] / MIB)]
             rows.append([point[0], point[1], size, of["milliseconds"], of["processor"], *memory])
-    headings = ["Gaussians", "views", "pixels", "ms per step", "ms of all threads", "peak MiB"]
-    print(table([*headings, "maps in NumPy MiB", "maps in the Splatter MiB"], rows))
+    headings = ["Gaussians", "views", "pixels", "ms per step", "ms of all threads", "peak MiB", "maps and masks MiB"]
+    print(table(headings, rows))
 
 
 def print_exponents(curves, found):
@@ -179,19 +168,18 @@ def print_exponents(curves, found):
     for axis, points in curves.items():
         of = series(axis, points, found)
         rows.append([axis, *(slope_text(*of[what]) for what in ("processor", "peak", "maps"))])
-    print(table(["axis", "ms of all threads", "peak memory", "maps in the Splatter"], rows))
+    print(table(["axis", "ms of all threads", "peak memory", "maps and masks"], rows))
 
 
 def print_large(point, of):
-    """What the maps of one large scene take, array by array, and what the process takes around them."""
+    """What maps and masks of one large scene take, array by array, and what the process takes around them."""
     count, views, width, height = point
     print(f"{views} views of {width} x {height} px, {of['edge_pixels']:.0f} edge pixels in each, {count} Gaussians:\n")
-    rows = [["NumPy, what the reader hands over", "maps", of["host_maps"], f"{of['host_maps'] / MIB:.1f}"]]
-    rows += [["Splatter", name, size, f"{size / MIB:.1f}"] for name, size in of["arrays"].items()]
-    rows.append(["Splatter", "all of these", of["edge_images"], f"{of['edge_images'] / MIB:.1f}"])
-    print(table(["where", "array", "bytes", "MiB"], rows))
+    sizes = of["arrays"] | {"all of these": of["edge_images"]}
+    print(table(["array", "bytes", "MiB"], [[name, size, f"{size / MIB:.1f}"] for name, size in sizes.items()]))
     fits = "fit" if of["edge_images"] <= 1024 * MIB else "do NOT fit"
-    print(f"\nThe Splatter's arrays {fits} in 1 GiB. Resident memory of the process:\n")
+    more = of["peak"] - of["edge_images"] / MIB
+    print(f"\nMaps and masks {fits} in 1 GiB; the whole process never takes more than {more:.0f} MiB above them:\n")
     moments = {
         "Taichi started": "begun",
         "maps drawn": "with_maps",
@@ -199,12 +187,12 @@ def print_large(point, of):
         "Splatter built": "built",
         "while steps are done (peak)": "stepping",
     }
-    print(table(["moment", "MiB"], [[label, f"{of[key]:.0f}"] for label, key in moments.items()]))
+    print(table(["moment", "resident MiB"], [[label, f"{of[key]:.0f}"] for label, key in moments.items()]))
 
 
 def parse_arguments(arguments=None):
     """The command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.scaling", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python benchmarks/scaling.py", description=__doc__.splitlines()[0])
     whole = {"type": int, "nargs": "*"}
     parser.add_argument("--gaussians", **whole, default=[2_000, 5_000, 10_000, 50_000, 200_000, 500_000])
     parser.add_argument("--views", **whole, default=[50, 100, 200, 500, 1_000])
@@ -214,7 +202,7 @@ def parse_arguments(arguments=None):
     large = {"type": int, "nargs": 3, "metavar": ("VIEWS", "WIDTH", "HEIGHT")}
     parser.add_argument("--large", **large, default=[1_000, 1_200, 680], help="the scene whose memory is broken down")
     parser.add_argument("--threads", type=int, default=available_threads())
-    parser.add_argument("--repeats", type=int, default=11, help="view steps measured at each point")
+    parser.add_argument("--repeats", type=int, default=5, help="rounds of view steps measured at each point")
     parser.add_argument("--pause", type=float, default=0.0, help="seconds between points, for others on the machine")
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "scaling.png", help="the picture")
     parser.add_argument("--point", type=int, nargs=6, help=argparse.SUPPRESS)  # the process of one point
@@ -234,14 +222,15 @@ def main(arguments=None):
         print("measuring {} Gaussians, {} views of {} x {} px".format(*point), file=sys.stderr)
         found[point] = measure(point, options)
         time.sleep(options.pause)
-    print(f"{machine_line()}\n{options.threads} threads, medians of {options.repeats} steps\n")
+    print(f"{machine_line()}\n{options.threads} threads, medians of {options.repeats} rounds of view steps\n")
     print_points(curves, found)
     print("\nExponents (log-log slope over all points, and of the last two):\n")
     print_exponents(curves, found)
     print()
     print_large(large, found[large])
-    draw_curves(options.out, curves, found)
-    print(f"\n{options.out}")
+    if curves:
+        draw_curves(options.out, curves, found)
+        print(f"\n{options.out}")
     return found
 
 

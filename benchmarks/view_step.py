@@ -1,11 +1,9 @@
-"""One view step of a Splatter, timed whole and in parts, and its state as arrays.
+"""View steps of a Splatter, timed whole and in parts, and their state as arrays.
 
 Only what the Splatter offers to everybody is called; the parts come from Taichi's own profiler, by the names of the
 kernels. A renamed kernel shows up as itself, outside the parts: then `PARTS` wants changing, and nothing else.
 """
 
-import contextlib
-import io
 import os
 import re
 import time
@@ -17,32 +15,28 @@ import taichi as ti
 from benchmarks.machine import benchmark_cache
 from taichi_edges.kernels.device import start_taichi
 from taichi_edges.splatting.gaussians import Gaussians
-from taichi_edges.splatting.splatter import GPU_ARCHS, Splatter
+from taichi_edges.splatting.splatter import GPU_ARCHS, PAGES, Splatter
 
 PROFILED = ("cpu", "cuda")  # the devices whose kernels Taichi's profiler measures
 RATES = (1e-12, 1e-12, 1e-12, 1e-12)  # Adam does all its work, and the Gaussians stay where they are
+ROUND = PAGES  # view steps whose pixels are selected at once
 
 # part: (kernel names as a regular expression, whether it is their derivative made by Taichi)
 PARTS = {
-    "select": (r"select_.*", False),
-    "project": (r"project.*", False),
-    "forward": (r"draw.*|combine.*", False),
-    "loss": (r"image_loss.*", False),
-    "loss'": (r"image_loss.*", True),
-    "backward": (r"spread_adjoint.*|gather_adjoint.*", False),
-    "project'": (r"project.*", True),
-    "Adam": (r"adam.*", False),
+    "select": (r"select", False),
+    "forward": (r"draw_.*|blend_.*", False),
+    "backward": (r"gather", False),
+    "project'": (r"project", True),
+    "Adam": (r"adam", False),
 }
 KERNEL = re.compile(r"(?P<name>.+?)_c\d+_\d+(?P<reverse>_reverse_grad)?_kernel_\d+")
 
 
 def start(arch, threads, profile=True):
     """Start Taichi as training does; with its profiler if it is wanted and there is one."""
-    os.environ["TI_KERNEL_PROFILER"] = str(
-        int(profile and arch in PROFILED)
-    )  # ti.init takes what the call does not name from here
-    with contextlib.redirect_stdout(io.StringIO()):  # it announces itself with a bare print
-        start_taichi(arch, threads, 0, benchmark_cache() / "kernels")
+    # ti.init takes what the call does not name from the environment.
+    os.environ["TI_KERNEL_PROFILER"] = str(int(profile and arch in PROFILED))
+    start_taichi(arch, threads, 0, benchmark_cache() / "kernels")
 
 
 def make_splatter(scene, count, arch, threads):
@@ -52,26 +46,36 @@ def make_splatter(scene, count, arch, threads):
     return Splatter(scene.edge_maps, *cameras, capacity=count, threads=threads, schedule=schedule)
 
 
-def view_step(splatter, view, number):
-    """One step of training on one view, as `Training` does it. number: counts from 1, and is the seed."""
-    splatter.select_pixels(view, number)
-    splatter.record(view)
-    splatter.update(number, *RATES)
+def views_of_round(number, view_count):
+    """(ROUND,) the views of a round, in turn. number: counts from 0."""
+    return (number * ROUND + np.arange(ROUND)) % view_count
+
+
+def do_round(splatter, number):
+    """A round of view steps, as `Training` does them. Returns their losses, (ROUND,). number: counts from 0."""
+    first = number * ROUND + 1  # of the steps, and of the seeds
+    splatter.select_pixels(views_of_round(number, len(splatter.images.edge_counts)), first + np.arange(ROUND))
+    losses = np.zeros(ROUND)
+    for page in range(ROUND):
+        splatter.record(page)
+        losses[page] = splatter.loss[None]
+        splatter.update(first + page, *RATES)
     ti.sync()
+    return losses
 
 
-def time_step(splatter, view, number):
-    """{part: milliseconds} of one view step: 'step' is the whole, 'launches' what no kernel accounts for."""
+def time_round(splatter, number):
+    """{part: milliseconds per view step} of one round: 'step' is the whole, 'launches' what no kernel accounts for."""
     profiler = ti.lang.impl.current_cfg().kernel_profiler
     if profiler:
         ti.profiler.clear_kernel_profiler_info()
     started = time.perf_counter()
-    view_step(splatter, view, number)
+    do_round(splatter, number)
     times = {"step": (time.perf_counter() - started) * 1e3}
     if profiler:
         kernels = kernel_times()
         times |= kernels | {"launches": times["step"] - sum(kernels.values())}
-    return times
+    return {part: milliseconds / ROUND for part, milliseconds in times.items()}
 
 
 def kernel_times():
@@ -94,50 +98,73 @@ def part_of(task):
     return name + ("'" if reverse else "")
 
 
-def medians(steps):
-    """{part: median milliseconds} of several `time_step`s."""
-    parts = dict.fromkeys(part for step in steps for part in step)
-    return {part: float(np.median([step.get(part, 0.0) for step in steps])) for part in parts}
+def medians(rounds):
+    """{part: median milliseconds} of several `time_round`s."""
+    parts = dict.fromkeys(part for times in rounds for part in times)
+    return {part: float(np.median([times.get(part, 0.0) for times in rounds])) for part in parts}
+
+
+@dataclass(frozen=True, eq=False)
+class DumpedRound:
+    """What the splats of a round are given, as arrays.
+
+    shape: (height, width). poses: (ROUND, 3, 4) world to camera. pinholes: (ROUND, 4) fx, fy, cx, cy. words: (ROUND,
+    height, w, 2), columns, targets: (ROUND, capacity), counts: (ROUND,) as in PixelSelection. level: target from which
+    on a pixel counts as an edge pixel. weights: (ROUND, 2) in the loss, of an edge pixel and of a background pixel.
+    """
+
+    shape: tuple
+    gaussians: Gaussians
+    poses: np.ndarray
+    pinholes: np.ndarray
+    words: np.ndarray
+    columns: np.ndarray
+    targets: np.ndarray
+    counts: np.ndarray
+    level: float
+    weights: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class DumpedStep:
-    """What the splat of one view step was given and what it made of it, as arrays.
+    """What the splat of one step made of it: slots p, Gaussians n.
 
-    shape: (height, width). splats: (n, 6) u, v, conic a, b, c, opacity. boxes: (n, 4) u0, u1, v0, v1, ends exclusive.
-    pixels: (p,) row * width + column. transmittance, d_transmittance: (p,) T and dL/dT. gradients: Gaussians,
-    dL/d(parameters). pull: (n,) the absolute positional gradients.
+    transmittance: (p,). gradients: Gaussians, dL/d(parameters). pull: (n,) the absolute positional gradients.
     """
 
-    shape: tuple
-    splats: np.ndarray
-    boxes: np.ndarray
-    pixels: np.ndarray
     transmittance: np.ndarray
-    d_transmittance: np.ndarray
+    loss: float
     gradients: Gaussians
     pull: np.ndarray
 
 
-def dump_step(splatter, view, number):
-    """Do one more view step and read everything the C floor needs."""
-    fields, selection, target = splatter.fields, splatter.selection, splatter.splats
-    fields.positional_gradients.fill(0)
-    splatter.select_pixels(view, number)
-    splatter.record(view)
-    count, slots = fields.count, selection.count
-    transmittance, weights, image = (
-        field.to_numpy()[:slots] for field in (selection.transmittance, selection.weights, selection.targets)
-    )
-    dumped = DumpedStep(
+def dump_round(splatter):
+    """The state of the round that was done last."""
+    selection, cameras = splatter.selection, splatter.cameras
+    return DumpedRound(
         shape=(selection.height, selection.width),
-        splats=target.splats.to_numpy()[:count],
-        boxes=target.boxes.to_numpy()[:count],
-        pixels=selection.pixels.to_numpy()[:slots],
-        transmittance=transmittance,
-        d_transmittance=-weights * np.sign(1.0 - transmittance - image),  # of eq. 3
-        gradients=Gaussians(*(getattr(fields, name).grad.to_numpy()[:count] for name in fields.ARRAYS)),
-        pull=fields.positional_gradients.to_numpy()[:count],
+        gaussians=splatter.fields.gaussians(),
+        poses=cameras.world_to_camera.to_numpy()[selection.views],
+        pinholes=cameras.pinhole.to_numpy()[selection.views],
+        words=selection.words.to_numpy(),
+        columns=selection.columns.to_numpy(),
+        targets=selection.targets.to_numpy(),
+        counts=selection.counts.copy(),
+        level=(splatter.images.level - 0.5) / 255,
+        weights=np.array([splatter.weights(page) for page in range(selection.pages)]),
     )
-    splatter.update(number, *RATES)  # zeroes the gradients
+
+
+def dump_step(splatter, page):
+    """Record one page of the last round again and read what came out."""
+    fields = splatter.fields
+    fields.positional_gradients.fill(0)
+    splatter.record(page)
+    dumped = DumpedStep(
+        transmittance=splatter.selection.transmittance.to_numpy()[: splatter.selection.counts[page]],
+        loss=float(splatter.loss[None]),
+        gradients=Gaussians(*(getattr(fields, name).grad.to_numpy()[: fields.count] for name in fields.ARRAYS)),
+        pull=fields.positional_gradients.to_numpy()[: fields.count],
+    )
+    splatter.update(1, *RATES)  # zeroes the gradients
     return dumped

@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,18 +12,19 @@ import numpy as np
 import pytest
 
 from benchmarks.edge_scene import NOISE_PX, make_scene, scatter_gaussians
-from benchmarks.floor import FloorDiffers, FloorMissing, assert_same, compile_floor
+from benchmarks.floor import FloorDiffers, FloorMissing, FloorStep, assert_same, compile_floor
 from benchmarks.log_plot import log_ticks, tick_text
 from benchmarks.markdown import significant, table
 from benchmarks.scaling import slopes
-from benchmarks.view_step import DumpedStep, part_of
+from benchmarks.view_step import PARTS, DumpedStep, part_of
 from taichi_edges.cameras import project
 from taichi_edges.splatting.gaussians import Gaussians
 
 ROOT = Path(__file__).parent.parent
 SCENE = """
+preset: paper
 source: {reader: synthetic, part: block, views: 6, size: 64}
-train: {epochs: 3, gaussians: 300, seeds: random, only_means_epochs: 1}
+train: {epochs: 3, gaussians: 300, seeds: random}
 filter: {min_opacity: 0.0, min_support: 0.0}
 cluster: {max_gap: 0.3, min_points: 3, theta: 0.0}
 fit: {line_tolerance: 0.1}
@@ -31,11 +33,11 @@ fit: {line_tolerance: 0.1}
 
 @pytest.fixture(scope="module")
 def run(pytestconfig):
-    """run(module, *arguments) -> what `python -m benchmarks.<module>` prints."""
+    """run(*command) -> what `python <command>` prints, run from the root of the project."""
     cache = pytestconfig.cache.mkdir("benchmarks")
 
-    def run_one(module, *arguments):
-        command = [sys.executable, "-m", f"benchmarks.{module}", *map(str, arguments)]
+    def run_one(*arguments):
+        command = [sys.executable, *map(str, arguments)]
         environment = {**os.environ, "XDG_CACHE_HOME": str(cache)}
         done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=300)
         assert done.returncode == 0, done.stderr
@@ -63,13 +65,14 @@ def read_tables(text):
 
 
 def test_splat_prints_parts_and_ratios(run):
-    text = run("splat", "--sizes", 300, 500, "--size", 200, "--repeats", 2, "--threads", 2)
+    text = run("benchmarks/splat.py", "--sizes", 300, 500, "--size", 200, "--repeats", 2, "--threads", 2)
     assert "Taichi" in text.splitlines()[0]
     steps, ratios = read_tables(text)
     assert [row["Gaussians"] for row in steps] == [row["Gaussians"] for row in ratios] == ["300", "500"]
     for row in steps:
         assert int(row["pixels"]) > 100
-        assert all(float(row[part]) > 0 for part in ("project", "forward", "backward", "project'", "Adam", "step"))
+        assert all(float(row[part]) > 0 for part in ("select", "forward", "backward", "project'", "Adam", "step"))
+        assert set(row) == {"Gaussians", "pixels", *PARTS, "launches", "step", "launches %"}  # every kernel has a part
     for row in ratios:
         assert float(row["twin / loss"]) > 1 and float(row["twin / gradient"]) > 1
         if "No C floor" in text:
@@ -82,7 +85,7 @@ def test_pipeline_prints_stages_and_metrics(run, tmp_path):
     scene, lost = tmp_path / "tiny.yaml", tmp_path / "lost.yaml"
     scene.write_text(SCENE)
     lost.write_text("source: {path: /nowhere/at/all}\n")
-    text = run("pipeline", "--scene", scene, lost, "--threads", 2)
+    text = run("benchmarks/pipeline.py", "--scene", scene, lost, "--threads", 2)
     seconds, memory, found = read_tables(text)
     assert seconds[0]["scene"] == memory[0]["scene"] == found[0]["scene"] == "tiny" and len(seconds) == 1
     stages = ("prepare", "train", "cluster", "fit", "evaluate", "export")
@@ -95,7 +98,7 @@ def test_pipeline_prints_stages_and_metrics(run, tmp_path):
 def test_scaling_prints_points_and_draws(run, tmp_path):
     picture = tmp_path / "curves.png"
     base = ("--base", 300, 4, 96, "--large", 4, 96, 96, "--repeats", 1, "--threads", 2, "--out", picture)
-    text = run("scaling", "--gaussians", 300, 600, "--views", 4, "--sizes", 96, *base)
+    text = run("benchmarks/scaling.py", "--gaussians", 300, 600, "--views", 4, "--sizes", 96, *base)
     points, exponents, arrays, moments = read_tables(text)
     assert [row["Gaussians"] for row in points] == ["300", "600", "300", "300"]
     assert all(
@@ -103,9 +106,15 @@ def test_scaling_prints_points_and_draws(run, tmp_path):
         for row in points
     )
     assert exponents[0]["ms of all threads"].endswith("at the end)") and exponents[1]["ms of all threads"] == "-"
-    assert {"maps": str(4 * 96 * 96)}.items() <= {row["array"]: row["bytes"] for row in arrays}.items()
-    assert "The Splatter's arrays fit in 1 GiB" in text and len(moments) == 5
+    maps, words = 4 * 96 * 96, 4 * 96 * 3 * 4
+    wanted = {"maps of the reader": maps, "words": words, "all of these": maps + words}
+    assert {row["array"]: int(row["bytes"]) for row in arrays} == wanted
+    assert "Maps and masks fit in 1 GiB" in text and len(moments) == 5
     assert cv2.imread(str(picture)).std() > 5
+
+
+def test_scripts_are_modules_too(run):
+    assert "usage: python benchmarks/splat.py" in run("-m", "benchmarks.splat", "--help")
 
 
 # Their rooms --------------------------------------------------------------------------------------------------------
@@ -131,18 +140,18 @@ def test_floor_that_differs_is_refused(generator):
     direction = Gaussians(*(np.ones(shape) for shape in ((count, 3), (count, 3), (count, 4), (count,))))
     slope = (gradients * slopes_of_splats).sum(axis=1)
     taichi_gradients = Gaussians(np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 4)), slope)
-    transmittance = generator.random(slots)
-    unused = dict.fromkeys(("shape", "splats", "boxes", "pixels", "d_transmittance"))
-    step = DumpedStep(**unused, transmittance=transmittance, gradients=taichi_gradients, pull=pull)
-    assert_same(step, transmittance, gradients, pull, slopes_of_splats, direction)
-    with pytest.raises(FloorDiffers, match="transmittance: .* differ"):
-        assert_same(step, transmittance * 0.99, gradients, pull, slopes_of_splats, direction)
-    with pytest.raises(FloorDiffers, match="gradient: off by"):
-        assert_same(step, transmittance, gradients * [1, 1, 1, 1, 1, 1.1], pull, slopes_of_splats, direction)
-    with pytest.raises(FloorDiffers, match="positional"):
-        assert_same(step, transmittance, gradients, pull * 1.01, slopes_of_splats, direction)
-    with pytest.raises(FloorDiffers, match="transmittance"):
-        assert_same(step, transmittance * np.nan, gradients, pull, slopes_of_splats, direction)
+    step = DumpedStep(generator.random(slots), 0.25, taichi_gradients, pull)
+    same = FloorStep(step.transmittance, 0.25, gradients, pull)
+    assert_same(step, same, slopes_of_splats, direction)
+    for changed, message in (
+        ({"transmittance": step.transmittance * 0.99}, "transmittance: .* differ"),
+        ({"transmittance": step.transmittance * np.nan}, "transmittance: .* differ"),
+        ({"loss": 0.2501}, "loss: 0.2501 instead of 0.25"),
+        ({"gradients": gradients * [1, 1, 1, 1, 1, 1.1]}, "gradient: off by"),
+        ({"pull": pull * 1.01}, "positional"),
+    ):
+        with pytest.raises(FloorDiffers, match=message):
+            assert_same(step, replace(same, **changed), slopes_of_splats, direction)
 
 
 def test_missing_compiler_is_named(monkeypatch, tmp_path):
@@ -157,10 +166,11 @@ def test_floor_compiles():
 
 
 def test_kernels_belong_to_parts():
-    assert part_of("project_c86_0_kernel_1_range_for") == "project"
-    assert part_of("project_c87_0_reverse_grad_kernel_1_range_for") == "project'"
     assert part_of("draw_product_c88_0_kernel_0_range_for") == "forward"
-    assert part_of("image_loss_c85_0_reverse_grad_kernel_1_range_for") == "loss'"
+    assert part_of("blend_serial_c90_0_kernel_0_serial") == "forward"
+    assert part_of("gather_c92_0_kernel_1_range_for") == "backward"
+    assert part_of("project_c87_0_reverse_grad_kernel_1_range_for") == "project'"
+    assert part_of("project_c86_0_kernel_1_range_for") == "project"  # drawing projects by itself
     assert part_of("something_new_c3_0_kernel_0_serial") == "something_new"
 
 
