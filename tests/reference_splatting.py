@@ -177,9 +177,12 @@ def selected(splatter, page=0):
     rows, columns = np.nonzero(chosen)
     np.testing.assert_array_equal(selection.columns.to_numpy()[page, :count], columns)
     targets = selection.targets.to_numpy()[page, :count]
-    maps = splatter.images.maps
-    maps = maps if isinstance(maps, np.ndarray) else maps.to_numpy()
-    edges = maps[selection.views[page], rows, columns] >= splatter.images.level
+    images = splatter.images
+    maps = images.maps
+    if not isinstance(maps, np.ndarray):  # four pixels in a word
+        pixels = maps.to_numpy().astype("<u4").view(np.uint8)[:, : images.height * images.width]
+        maps = pixels.reshape(-1, images.height, images.width)
+    edges = maps[selection.views[page], rows, columns] >= images.level
     return np.stack([columns, rows], axis=1), np.where(edges, *splatter.weights(page)), targets
 
 

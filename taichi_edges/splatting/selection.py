@@ -9,6 +9,7 @@ import numpy as np
 import taichi as ti
 
 WORD = 32  # pixels in a word of the mask
+MULTIPLIER, INCREMENT = 747796405, 2891336453  # of the generator's linear congruence
 BLOCK = 512  # Taichi's CPU backend gives a thread no fewer items of a range-for than this
 
 
@@ -64,28 +65,97 @@ def slots_of(words: ti.template(), page, row, u0, u1):
     return start, before + ti.cast(ti.math.popcnt(mask & up_to_u1), ti.i32)
 
 
-def make_select(selection, threads, schedule):
-    """Kernel select(count, views, seeds, backgrounds, edge_maps, edge_words, words): one view per page, in parallel.
+@ti.func
+def next_state(state):
+    """One step of the random generator, PCG-RXS-M-XS (O'Neill 2014)."""
+    return state * ti.u32(MULTIPLIER) + ti.u32(INCREMENT)
 
-    views, seeds, backgrounds: (count,). All edge pixels of a view and `background` others, drawn without repetition
-    (paper eq. 3); every pixel where `background` is negative. One page is one thread's, so that one seed gives one
-    selection.
+
+@ti.func
+def state_after(seed, steps):
+    """The generator's state after `steps` steps, found by squaring: 17 rounds for 100 000 (Brown 1994)."""
+    state, multiplier, increment = seed, ti.u32(MULTIPLIER), ti.u32(INCREMENT)
+    rest = steps
+    while rest > 0:
+        if rest & 1:
+            state = state * multiplier + increment
+        increment *= multiplier + ti.u32(1)
+        multiplier *= multiplier
+        rest >>= 1
+    return state
+
+
+@ti.func
+def pixel_of(state, pixels):
+    """The pixel, one of `pixels`, that a state of the generator draws."""
+    hashed = ((state >> ((state >> 28) + ti.u32(4))) ^ state) * ti.u32(277803737)
+    hashed = (hashed >> 22) ^ hashed
+    return ti.cast((ti.cast(hashed, ti.u64) * ti.cast(pixels, ti.u64)) >> 32, ti.i32)
+
+
+@ti.func
+def whole_word(word, width):
+    """Mask of the columns that a word of a row has; fewer than 32 at the end of the row."""
+    return ti.u32(0xFFFFFFFF) >> ti.cast(ti.max((word + 1) * WORD - width, 0), ti.u32)
+
+
+def make_list_row(selection, packed):
+    """ti.func list_row(page, view, row, width, first, edge_maps, words): fill the slots of a row from `first` on.
+
+    Returns the first slot of the next row. packed: whether edge maps are four pixels in a u32, (V, H W / 4), or u8
+    (V, H, W).
     """
     columns, targets, real = selection.columns, selection.targets, selection.real
-    # Items of the loop that share a thread, and the pages worked on at once.
-    block, lanes = (1, selection.pages) if schedule == "log" else (BLOCK, min(threads, selection.pages))
+
+    @ti.func
+    def grey_level(view, row, column, width, edge_maps: ti.template()):
+        level = ti.u32(0)
+        if ti.static(packed):
+            pixel = row * width + column
+            level = (edge_maps[view, pixel >> 2] >> ti.cast((pixel & 3) << 3, ti.u32)) & ti.u32(255)
+        else:
+            level = ti.cast(edge_maps[view, row, column], ti.u32)
+        return ti.cast(level, real)
+
+    @ti.func
+    def list_row(page, view, row, width, first, edge_maps: ti.template(), words: ti.template()):
+        slot = first
+        for word in range(words.shape[2]):
+            words[page, row, word, 1] = ti.cast(slot, ti.u32)
+            bits = words[page, row, word, 0]
+            while bits != 0:
+                column = word * WORD + lowest_bit(bits)
+                bits &= bits - ti.u32(1)
+                columns[page, slot] = ti.cast(column, real)
+                targets[page, slot] = grey_level(view, row, column, width, edge_maps) * (1.0 / 255.0)
+                slot += 1
+        return slot
+
+    return list_row
+
+
+def make_select(selection, threads, schedule):
+    """select(count, views, seeds, backgrounds, edge_maps, edge_words, words): one view per page, in parallel.
+
+    views, seeds, backgrounds: (count,). All edge pixels of a view and `background` others, drawn without repetition
+    (paper eq. 3); every pixel where `background` is negative. One seed gives one selection, whatever the schedule.
+    """
+    return make_select_parallel(selection) if schedule == "log" else make_select_pages(selection, threads)
+
+
+def make_select_pages(selection, threads):
+    """Kernel select for a CPU: one page is one thread's."""
+    lanes = min(threads, selection.pages)  # pages worked on at once
+    list_row = make_list_row(selection, packed=False)
 
     @ti.func
     def draw_background(page, seed, background, width, height, words: ti.template()):
         """Set the bits of `background` pixels that are not set yet."""
         state = seed
-        pixels = ti.cast(width * height, ti.u64)
         found = 0
         while found < background:
-            state = state * ti.u32(747796405) + ti.u32(2891336453)  # PCG-RXS-M-XS, O'Neill 2014
-            hashed = ((state >> ((state >> 28) + ti.u32(4))) ^ state) * ti.u32(277803737)
-            hashed = (hashed >> 22) ^ hashed
-            pixel = ti.cast((ti.cast(hashed, ti.u64) * pixels) >> 32, ti.i32)
+            state = next_state(state)
+            pixel = pixel_of(state, width * height)
             row = pixel // width
             column = pixel - row * width
             bit = ti.u32(1) << ti.cast(column & 31, ti.u32)
@@ -94,34 +164,18 @@ def make_select(selection, threads, schedule):
                 found += 1
 
     @ti.func
-    def list_pixels(page, view, height, row_words, edge_maps: ti.template(), words: ti.template()):
-        """Fill the slots and the counts from the mask."""
-        slot = 0
-        for row in range(height):
-            for word in range(row_words):
-                words[page, row, word, 1] = ti.cast(slot, ti.u32)
-                bits = words[page, row, word, 0]
-                while bits != 0:
-                    column = word * WORD + lowest_bit(bits)
-                    bits &= bits - ti.u32(1)
-                    columns[page, slot] = ti.cast(column, real)
-                    targets[page, slot] = ti.cast(edge_maps[view, row, column], real) * (1.0 / 255.0)
-                    slot += 1
-
-    @ti.func
     def fill_page(
         page, view, seed, background, edge_maps: ti.template(), edge_words: ti.template(), words: ti.template()
     ):
-        height, width, row_words = edge_maps.shape[1], edge_maps.shape[2], edge_words.shape[2]
+        height, width = edge_maps.shape[1], edge_maps.shape[2]
         for row in range(height):
-            for word in range(row_words):
+            for word in range(edge_words.shape[2]):
                 bits = edge_words[view, row, word]
-                if background < 0:
-                    spare = ti.max((word + 1) * WORD - width, 0)  # bits beyond the end of the row
-                    bits = ti.u32(0xFFFFFFFF) >> ti.cast(spare, ti.u32)
-                words[page, row, word, 0] = bits
+                words[page, row, word, 0] = bits if background >= 0 else whole_word(word, width)
         draw_background(page, seed, background, width, height, words)
-        list_pixels(page, view, height, row_words, edge_maps, words)
+        slot = 0
+        for row in range(height):
+            slot = list_row(page, view, row, width, slot, edge_maps, words)
 
     @ti.kernel
     def select(
@@ -133,11 +187,97 @@ def make_select(selection, threads, schedule):
         edge_words: ti.types.ndarray(dtype=ti.u32, ndim=3),
         words: ti.types.ndarray(dtype=ti.u32, ndim=4),
     ):
-        for item in range(lanes * block):
-            turns = (count + lanes - 1) // lanes if item % block == 0 else 0
+        for item in range(lanes * BLOCK):  # one block of items is one thread
+            turns = (count + lanes - 1) // lanes if item % BLOCK == 0 else 0
             for turn in range(turns):
-                page = item // block + turn * lanes
+                page = item // BLOCK + turn * lanes
                 if page < count:
                     fill_page(page, views[page], seeds[page], backgrounds[page], edge_maps, edge_words, words)
+
+    return select
+
+
+def make_select_parallel(selection):
+    """select for a GPU: as many threads as there are words, draws and rows, and no long loop in any of them.
+
+    One thread for a page would go some 60 000 rounds one after the other; Mesa's software driver silently ends the
+    loops of a thread after 65 535. The drawn pixels are the first so many different ones of a random sequence. While n
+    are missing, the next n draws cannot find too many, so they are made at once, in any order, and the selection is
+    that of one draw after the other. A round leaves the share that is set already: of lines, five rounds leave nothing.
+    """
+    pages, height, width = selection.pages, selection.height, selection.width
+    list_row = make_list_row(selection, packed=True)
+    row_counts = ti.field(ti.i32, shape=(pages, height))
+    drawn, missing, found = (ti.field(ti.i32, shape=pages) for _ in range(3))  # draws made; pixels to find; those found
+
+    @ti.kernel
+    def set_edges(
+        count: ti.i32,
+        width: ti.i32,
+        views: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        backgrounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        edge_words: ti.types.ndarray(dtype=ti.u32, ndim=3),
+        words: ti.types.ndarray(dtype=ti.u32, ndim=4),
+    ):
+        for page, row, word in ti.ndrange(count, edge_words.shape[1], edge_words.shape[2]):
+            bits = edge_words[views[page], row, word]
+            words[page, row, word, 0] = bits if backgrounds[page] >= 0 else whole_word(word, width)
+        for page in range(pages):
+            drawn[page], found[page] = 0, 0
+            missing[page] = ti.max(backgrounds[page], 0) if page < count else 0
+
+    @ti.func
+    def draw(page, width, state, words: ti.template()):
+        """Set the bit of one pixel. Returns 1 where it was not set yet, else 0."""
+        pixel = pixel_of(state, width * words.shape[1])
+        row = pixel // width
+        column = pixel - row * width
+        bit = ti.u32(1) << ti.cast(column & 31, ti.u32)
+        before = ti.atomic_or(words[page, row, column >> 5, 0], bit)
+        return 1 if (before & bit) == 0 else 0
+
+    @ti.kernel
+    def draw_missing(
+        count: ti.i32,
+        longest: ti.i32,
+        width: ti.i32,
+        seeds: ti.types.ndarray(dtype=ti.u32, ndim=1),
+        words: ti.types.ndarray(dtype=ti.u32, ndim=4),
+    ) -> ti.i32:
+        for page, turn in ti.ndrange(count, longest):
+            if turn < missing[page]:
+                found[page] += draw(page, width, state_after(seeds[page], drawn[page] + turn + 1), words)
+        most = 0
+        for page in range(pages):
+            drawn[page] += missing[page]
+            missing[page], found[page] = missing[page] - found[page], 0
+            ti.atomic_max(most, missing[page])
+        return most
+
+    @ti.kernel
+    def list_pixels(
+        count: ti.i32,
+        width: ti.i32,
+        views: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        edge_maps: ti.types.ndarray(dtype=ti.u32, ndim=2),
+        words: ti.types.ndarray(dtype=ti.u32, ndim=4),
+    ):
+        for page, row in ti.ndrange(count, words.shape[1]):
+            total = 0
+            for word in range(words.shape[2]):
+                total += ti.cast(ti.math.popcnt(words[page, row, word, 0]), ti.i32)
+            row_counts[page, row] = total
+        for page, row in ti.ndrange(count, words.shape[1]):
+            slot = 0
+            for above in range(row):
+                slot += row_counts[page, above]
+            list_row(page, views[page], row, width, slot, edge_maps, words)
+
+    def select(count, views, seeds, backgrounds, edge_maps, edge_words, words):
+        set_edges(count, width, views, backgrounds, edge_words, words)
+        longest = int(backgrounds.max())
+        while longest > 0:
+            longest = draw_missing(count, longest, width, seeds, words)
+        list_pixels(count, width, views, edge_maps, words)
 
     return select

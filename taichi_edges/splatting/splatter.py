@@ -16,9 +16,10 @@ PAGES = 16  # views whose pixels are selected in one launch
 
 
 class EdgeImages:
-    """The edge maps as the kernels read them: u8 maps and bit masks of their edge pixels.
+    """The edge maps as the kernels read them: maps and bit masks of their edge pixels.
 
-    On a CPU the kernels read the given maps where they are: a copy would double the largest thing in memory.
+    On a CPU the kernels read the given u8 maps (V, H, W) where they are: a copy would double the largest thing in
+    memory. A GPU gets a copy, view by view, four pixels in a u32: (V, H W / 4). Taichi would copy byte by byte.
     """
 
     def __init__(self, edge_maps, threshold, on_gpu=False):
@@ -31,16 +32,32 @@ class EdgeImages:
             edges = edge_map >= self.level
             self.edge_counts[view] = np.count_nonzero(edges)
             words[view] = pack_mask(edges)
-        self.maps = np.ascontiguousarray(edge_maps)
+        self.maps = _upload_maps(edge_maps) if on_gpu else np.ascontiguousarray(edge_maps)
         self.words = words
         if on_gpu:
-            self.maps, self.words = _to_device(self.maps, ti.u8), _to_device(words, ti.u32)
+            self.words = ti.ndarray(ti.u32, shape=words.shape)
+            self.words.from_numpy(words)
 
 
-def _to_device(array, dtype):
-    device = ti.ndarray(dtype, shape=array.shape)
-    device.from_numpy(array)
+def _upload_maps(edge_maps):
+    """(V, H, W) uint8 -> ndarray (V, ceil(H W / 4)) of u32 on the device, the first pixel in the lowest byte."""
+    count, pixels = len(edge_maps), edge_maps[0].size
+    device = ti.ndarray(ti.u32, shape=(count, -(-pixels // 4)))
+    packed = np.zeros(4 * device.shape[1], np.uint8)
+    for view in range(count):
+        packed[:pixels] = edge_maps[view].ravel()
+        put_view(view, packed.view("<u4"), device)
+        ti.sync()  # or the copies on their way would pile up
     return device
+
+
+@ti.kernel
+def put_view(
+    view: ti.i32, values: ti.types.ndarray(dtype=ti.u32, ndim=1), device: ti.types.ndarray(dtype=ti.u32, ndim=2)
+):
+    """Row `view` of `device` from the host."""
+    for i in range(values.shape[0]):
+        device[view, i] = values[i]
 
 
 class Splatter:
@@ -107,6 +124,7 @@ class Splatter:
         if self.loss_mode == "balanced":
             backgrounds = np.minimum(edges, pixel_count - edges)
             selection.counts[: len(views)] = edges + backgrounds
+            backgrounds[edges + backgrounds == pixel_count] = -1  # all of them: nothing to draw
         else:
             backgrounds = np.full(len(views), -1)
             selection.counts[: len(views)] = pixel_count
