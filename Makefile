@@ -13,7 +13,7 @@ demo: setup
 	$(RUN) run.py scenes/demo.yaml
 
 test: setup
-	$(RUN) -m pytest -q
+	$(RUN) -m pytest -q -rs
 
 setup: $(VENV)/ready
 	@sh tools/system-libraries $(RUN)
