@@ -202,7 +202,7 @@ def parse_arguments(arguments=None):
     large = {"type": int, "nargs": 3, "metavar": ("VIEWS", "WIDTH", "HEIGHT")}
     parser.add_argument("--large", **large, default=[1_000, 1_200, 680], help="the scene whose memory is broken down")
     parser.add_argument("--threads", type=int, default=available_threads())
-    parser.add_argument("--repeats", type=int, default=5, help="rounds of view steps measured at each point")
+    parser.add_argument("--repeats", type=int, default=3, help="rounds of view steps measured at each point")
     parser.add_argument("--pause", type=float, default=0.0, help="seconds between points, for others on the machine")
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "scaling.png", help="the picture")
     parser.add_argument("--point", type=int, nargs=6, help=argparse.SUPPRESS)  # the process of one point
