@@ -202,21 +202,26 @@ def make_gather(gaussians, target, selection):
             u_absolute, v_absolute = 0.0, 0.0
             for row in range(box[2], box[3]):
                 dv = row - g[1]
+                row_one, row_u, row_uu = 0.0, 0.0, 0.0  # what dv multiplies is summed up for the whole row
                 start, end = slots_of(words, page, row, box[0], box[1])
                 for slot in range(start, end):
                     du = columns[page, slot] - g[0]
                     alpha = g[5] * exp2((a * du + b * dv) * du + c * dv * dv)
-                    counts = alpha >= ALPHA_MIN and alpha < ALPHA_MAX
-                    d_exponent = ti.select(counts, adjoint[slot] * alpha / (1.0 - ti.min(alpha, ALPHA_MAX)), 0.0)
-                    along_u, along_v = d_exponent * du, d_exponent * dv
-                    one += d_exponent
-                    u += along_u
-                    v += along_v
-                    uu += along_u * du
-                    uv += along_u * dv
-                    vv += along_v * dv
-                    u_absolute += ti.abs(g[2] * along_u + g[3] * along_v)
-                    v_absolute += ti.abs(g[3] * along_u + g[4] * along_v)
+                    drawn = ti.select(alpha >= ALPHA_MIN and alpha < ALPHA_MAX, alpha, 0.0)
+                    d_exponent = adjoint[slot] * drawn / (1.0 - drawn)
+                    along_u = d_exponent * du
+                    row_one += d_exponent
+                    row_u += along_u
+                    row_uu += along_u * du
+                    pull = ti.abs(d_exponent)
+                    u_absolute += pull * ti.abs(g[2] * du + g[3] * dv)
+                    v_absolute += pull * ti.abs(g[3] * du + g[4] * dv)
+                one += row_one
+                u += row_u
+                v += row_one * dv
+                uu += row_uu
+                uv += row_u * dv
+                vv += row_one * dv * dv
             scale = loss_gradient[None]
             slopes = ti.Vector(
                 [g[2] * u + g[3] * v, g[3] * u + g[4] * v, -0.5 * uu, -uv, -0.5 * vv, one / ti.max(g[5], 1e-30)]
