@@ -28,7 +28,15 @@ from taichi_edges.edges.clustering import (
     seed_order,
 )
 from taichi_edges.edges.filtering import filter_points, statistical_inliers
-from taichi_edges.edges.fitting import BENDING, _lsq_chain, fit_cluster, fit_clusters, fit_line, nearest_on_chain
+from taichi_edges.edges.fitting import (
+    BENDING,
+    _lsq_chain,
+    fit_cluster,
+    fit_clusters,
+    fit_curve,
+    fit_line,
+    nearest_on_chain,
+)
 from taichi_edges.edges.ordering import _bridge, connected_graph, order_points
 from taichi_edges.errors import UserError
 from taichi_edges.scene import ClusterConfig, FilterConfig, FitConfig
@@ -629,6 +637,16 @@ def test_isolated_points_are_outliers(generator):
 
 def test_too_few_points_have_no_outliers(generator):
     np.testing.assert_array_equal(statistical_inliers(generator.random((5, 3)), 10, 1.0), np.arange(5))
+
+
+@pytest.mark.parametrize("lobes", [6, 8])
+def test_a_rim_of_scallops_gets_the_pieces_it_needs_although_one_more_does_not_help(lobes):
+    angles = np.linspace(0, 2 * np.pi, 400, endpoint=False)
+    rim = np.stack([0.5 + 0.4 * np.cos(angles), 0.5 + 0.4 * np.sin(angles), 0.05 * np.cos(lobes * angles)], axis=1)
+    curves, error = fit_curve(rim, order_points(rim), 0.005)
+    assert error < 0.002 and len(curves) <= 4 * lobes
+    samples = evaluate_bezier(curves, np.linspace(0, 1, 50)).reshape(-1, 3)
+    assert cKDTree(samples).query(rim)[0].max() < 0.005
 
 
 def test_nothing_left_is_no_error(taichi):

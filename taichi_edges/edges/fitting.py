@@ -14,7 +14,8 @@ ROBUST_ROUNDS = 10
 REPARAMETRIZATIONS = 4
 TURN_PER_CUBIC = np.radians(100.0)  # one cubic follows a circular arc of 90 degrees to 3e-4 of the radius
 POINTS_PER_PIECE = 6  # at least
-WORTH_A_PIECE = 0.8  # another piece must bring the error down to this share
+WORTH_A_PIECE = 0.8  # another piece must bring the error down to this share, and again for every doubling of pieces
+LEAPS = (2, 3)  # times as many pieces, tried where one more does not pay and the chain is far off
 NOISE_FLOOR = 5e-4  # unit-cube units; a mean distance below is no reason for a curve or for another piece
 LINE_PARAMETERS = 4  # of a line in space
 END_QUANTILE = 0.01  # of the points along a line: its ends, so that one stray point does not lengthen it
@@ -108,18 +109,26 @@ def fit_curve(points, ordering, tolerance):
     """Chain of cubic Beziers through (n, 3) points by robust least squares over the arc-length parameter.
 
     The chain is a cubic spline with a continuous tangent, cut into its Bezier pieces; as many pieces as the points'
-    total turning asks for, and one more while that pays. (Continuous curvature as well would need twice the pieces to
-    follow a circle.) Returns control points (m, 4, 3) and the corrected mean distance of all points to the chain.
+    total turning asks for, and more while that pays. Where one more does not, but the points are off by more than
+    `tolerance`, twice and three times as many may, as on a rim of scallops. (Continuous curvature as well would need
+    twice the pieces to follow a circle.)
+    Returns control points (m, 4, 3) and the corrected mean distance of all points to the chain.
     """
     turning = 2 * np.pi if ordering.closed else total_turning(points, ordering.arc)
     most = max(len(points) // POINTS_PER_PIECE, 1)
     pieces = min(max(int(np.ceil(turning / TURN_PER_CUBIC)), 4 if ordering.closed else 1), most)
     curves, error = _fit_chain(points, ordering, tolerance, pieces)
-    for pieces in range(pieces + 1, most + 1):
-        more, smaller_error = _fit_chain(points, ordering, tolerance, pieces)
-        if max(smaller_error, NOISE_FLOOR) > WORTH_A_PIECE * error:
-            break
-        curves, error = more, smaller_error
+    tried = [pieces + 1, *(leap * pieces for leap in LEAPS)]
+    while tried:
+        count = tried.pop(0)
+        more_than_one = count > pieces + 1
+        if count > most or (more_than_one and error <= tolerance):
+            continue
+        more, smaller_error = _fit_chain(points, ordering, tolerance, count)
+        doublings = np.log2(count / pieces) if more_than_one else 1.0
+        if max(smaller_error, NOISE_FLOOR) <= WORTH_A_PIECE**doublings * error:
+            curves, error, pieces = more, smaller_error, count
+            tried = [pieces + 1, *(leap * pieces for leap in LEAPS)]
     return curves, error
 
 
