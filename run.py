@@ -31,7 +31,7 @@ def parse_arguments(arguments=None):
     parser.add_argument("--preset", choices=("fast", "paper"), help="training schedule (default: the scene's, or fast)")
     parser.add_argument("--seed", type=int, help="seed of every random choice (default: the scene's)")
     parser.add_argument("--threads", type=int, help="CPU threads (default: all this process may use)")
-    parser.add_argument("--arch", choices=("cpu", "cuda", "vulkan"), default="cpu", help="where training runs")
+    parser.add_argument("--arch", choices=("cpu", "cuda", "vulkan"), default="cpu", help="where the kernels run")
     parser.add_argument("--show", action="store_true", help="at the end, show points and edges in a window")
     parser.add_argument("--quiet", action="store_true", help="no progress, only warnings and the final summary")
     return parser.parse_args(arguments)

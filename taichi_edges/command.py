@@ -9,7 +9,7 @@ from taichi_edges.pipeline import STAGES, Run, expand, run_stages
 from taichi_edges.progress import make_progress
 from taichi_edges.scene_file import load_scene
 
-MOST_THREADS = 256  # each has an image of its own to draw into
+MOST_THREADS = 256  # each has a plane of its own to draw into
 
 
 def run_command(options):

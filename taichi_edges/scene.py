@@ -66,13 +66,14 @@ class DensityConfig(Section):
 class TrainConfig(Section):
     """Training of the Gaussians (paper 3.1, 3.2, supplement).
 
-    A run is as long as `epochs` or `steps` says; when things happen in it is written in shares of the run.
+    A run is as long as `epochs` or `steps` says; when things happen in it is written in shares of the run. The defaults
+    here are the paper's; a scene file starts from the values of its preset.
     """
 
     epochs: Annotated[int, Field(ge=0)] = Field(500, description="passes over all views; 0: train.steps counts")
     steps: Annotated[int, Field(ge=0)] = Field(0, description="view steps, at least one pass; 0: train.epochs counts")
     settled: Share = Field(
-        0.0, description="after the last cull, stop when a pass lowers the loss by no more than this share; 0: never"
+        0.0, description="stop when the last two passes lowered the loss by no more than this share each; 0: never"
     )
     gaussians: Count = Field(10_000, description="number of random points to start from")
     seeds: Literal["random", "points", "votes"] = Field(

@@ -1,6 +1,8 @@
 """The kernel cache survives killed processes, and arrays reach the kernels and come back."""
 
 import os
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -18,6 +20,15 @@ def test_only_a_lock_that_nobody_can_hold_any_more_is_removed(tmp_path, age, sta
         os.utime(path, (time.time() - age,) * 2)
     release_cache(tmp_path)
     assert lock.exists() == stays and kernel.exists()
+
+
+@pytest.mark.parametrize("folder", ["/proc/nowhere", "taken/kernels"])
+def test_without_a_place_for_the_cache_the_kernels_run_all_the_same(tmp_path, folder):
+    (tmp_path / "taken").write_text("a file where the folder should be")
+    code = "from taichi_edges.kernels.device import start_taichi, upload; import sys, taichi as ti\n"
+    code += "start_taichi('cpu', 1, 0, sys.argv[1]); x = ti.field(ti.f32, shape=3); x.fill(2.0); assert x[1] == 2.0"
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / folder)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_cache_that_is_not_there_yet_needs_nothing(tmp_path):

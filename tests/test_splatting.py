@@ -20,6 +20,7 @@ from reference_splatting import (
     selected,
 )
 
+from taichi_edges.splatting import splatter as splatter_module
 from taichi_edges.splatting.gaussians import Gaussians, rotation_matrices, start_gaussians
 from taichi_edges.splatting.projection import fast_exp2
 from taichi_edges.splatting.selection import pack_mask
@@ -166,6 +167,18 @@ def test_pages_hold_what_each_view_alone_would(open_splatter, seed, threads):
         assert splatter.select_pixels(view, pixel_seed) == counts[page]
         for of_page, alone in zip(together[page], selected(splatter)):
             np.testing.assert_array_equal(of_page, alone)
+
+
+def test_maps_too_large_for_one_array_are_handed_over_by_the_page(open_splatter, seed, monkeypatch):
+    splatter = open_splatter(random_scene(seed, WIDTH, HEIGHT))
+    selections = []
+    for most in (splatter_module.MOST_ELEMENTS, 1):
+        monkeypatch.setattr(splatter_module, "MOST_ELEMENTS", most)
+        splatter.select_pixels([MOSTLY_EDGES, OUTSIDE], [1, 2])
+        selections.append([selected(splatter, page) for page in range(2)])
+    for one, other in zip(*selections):
+        for array, same in zip(one, other):
+            np.testing.assert_array_equal(array, same)
 
 
 def test_loss_and_gradients_are_those_of_the_page(open_splatter, seed, generator):

@@ -3,3 +3,4 @@
 import os
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when Taichi is imported: no version line on stdout
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # nor a question to a server on the net

@@ -3,6 +3,7 @@
 import contextlib
 import gc
 import io
+import tempfile
 import time
 from pathlib import Path
 
@@ -15,13 +16,14 @@ STALE_LOCK = 60.0  # seconds; Taichi holds the lock of its kernel cache for some
 
 
 def start_taichi(arch, threads, seed, cache):
-    """ti.init for this project: f32, quiet, kernels cached in the folder `cache`.
+    """ti.init for this project: f32, quiet, kernels cached in the folder `cache` (not at all where it is read-only).
 
     What an earlier program held on the device is freed. arch: 'cpu', 'cuda' or 'vulkan'. UserError where the machine
     does not have it.
     """
     gc.collect()  # an ndarray of an earlier program that is freed later would take memory of the new one with it
     release_cache(Path(cache))
+    cached = _is_writable(Path(cache))  # else Taichi would crash
     available = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
     with contextlib.redirect_stdout(io.StringIO()):  # ti.init announces itself with a bare print
         ti.init(
@@ -29,13 +31,23 @@ def start_taichi(arch, threads, seed, cache):
             default_fp=ti.f32,
             cpu_max_num_threads=threads,
             random_seed=seed,
-            offline_cache=True,
-            offline_cache_file_path=str(cache),
+            offline_cache=cached,
+            **({"offline_cache_file_path": str(cache)} if cached else {}),
             log_level=ti.ERROR,
         )
     in_use = ti.lang.impl.current_cfg().arch
     if arch != "cpu" and in_use != available[arch]:
         raise UserError(f"--arch {arch}: this machine offers Taichi no {arch} device; use --arch cpu")
+
+
+def _is_writable(folder):
+    """Whether files can be written to a folder, which is made where it is not there."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
 
 
 def release_cache(cache):

@@ -12,6 +12,7 @@ from taichi_edges.splatting.splat import make_compare
 
 LOSSES = ("balanced", "class_weighted", "whole_image")  # eq. 3 first; the other two are the options the paper names
 GPU_ARCHS = ("cuda", "vulkan")
+MOST_ELEMENTS = 1 << 31  # of an array that a kernel is given: Taichi's indices are 32 bits wide
 PAGES = 16  # views whose pixels are selected in one launch
 
 
@@ -129,8 +130,10 @@ class Splatter:
             backgrounds = np.full(len(views), -1)
             selection.counts[: len(views)] = pixel_count
         selection.views[: len(views)] = views
-        arguments = (images.maps, images.words, selection.words)
-        self._select(len(views), views, seeds, backgrounds.astype(np.int32), *arguments)
+        maps, words = images.maps, images.words
+        if isinstance(maps, np.ndarray) and maps.size >= MOST_ELEMENTS:
+            maps, words, views = maps[views], words[views], np.arange(len(views), dtype=np.int32)
+        self._select(len(views), views, seeds, backgrounds.astype(np.int32), maps, words, selection.words)
         return selection.counts[: len(views)]
 
     def weights(self, page):

@@ -56,12 +56,13 @@ class Settling:
     """How much the loss still falls: what each view has now against what it had one pass before."""
 
     def __init__(self, views):
-        self.last = np.full(views, np.nan)
-        self.before, self.now = deque(maxlen=SETTLED_PASSES * views), deque(maxlen=SETTLED_PASSES * views)
+        """views: (n,) indices of those that are visited."""
+        self.last = {}
+        self.before, self.now = (deque(maxlen=SETTLED_PASSES * len(views)) for _ in range(2))
 
     def add(self, view, loss):
         """The loss that a view has now."""
-        if np.isfinite(self.last[view]):
+        if view in self.last:
             self.before.append(self.last[view])
             self.now.append(loss)
         self.last[view] = loss
@@ -78,10 +79,6 @@ class Training:
 
     def __init__(self, views, config, generator, threads=1, arch="cpu"):
         self.views, self.config, self.generator = views, config, generator
-        # A length in steps is enough for a few hundred views; of more, every one is seen once.
-        self.total = max(config.steps, len(views)) if config.steps else config.epochs * len(views)
-        self.settling = Settling(len(views))
-        self.actions = self._actions()
         self.neighbors_at = None
         self.splatter = Splatter(
             views.edge_maps,
@@ -94,6 +91,11 @@ class Training:
             threads=threads,
             schedule="log" if arch in GPU_ARCHS else "product",
         )
+        self.visited = self._views_with_pixels()
+        # A length in steps is enough for a few hundred views; of more, every one is seen once.
+        self.total = max(config.steps, len(self.visited)) if config.steps else config.epochs * len(self.visited)
+        self.settling = Settling(self.visited)
+        self.actions = self._actions()
 
     def run(self, gaussians, progress):
         """Train `gaussians`. Returns the trained ones and the list of LogRecords."""
@@ -117,15 +119,28 @@ class Training:
         return self.splatter.fields.gaussians(), records
 
     def _has_settled(self, step):
-        """Whether the run may end here: nothing more is scheduled, and the loss hardly falls."""
-        return step >= max(self.actions, default=0) and 0 < self.config.settled >= self.settling.drop()
+        """Whether the run may end here: all that is scheduled has begun, and the loss hardly falls."""
+        config = self.config
+        begun = max(config.only_means, config.regularize_from) * self.total
+        return step >= max(begun, *self.actions, 1) and 0 < config.settled >= self.settling.drop()
+
+    def _views_with_pixels(self):
+        """Indices of the views in which pixels can be selected: for eq. 3 those with edge pixels."""
+        if self.config.loss != "balanced":
+            return np.arange(len(self.views))
+        visited = np.flatnonzero(self.splatter.images.edge_counts)
+        if len(visited) == 0:
+            raise UserError(
+                f"none of the {len(self.views)} edge maps has an edge pixel after thinning; lower train.edge_threshold "
+                "or source.thin_threshold, or set source.thin: false"
+            )
+        return visited
 
     def _selected_views(self):
         """(page, view) without end: pass after pass in random order, their pixels selected some views at a time."""
         pages = self.splatter.selection.pages
-        with_edges = np.flatnonzero(self.splatter.images.edge_counts)
         while True:
-            order = self.generator.permutation(with_edges)
+            order = self.generator.permutation(self.visited)
             seeds = self.generator.integers(1 << 32, size=len(order))
             for first in range(0, len(order), pages):
                 some = slice(first, first + pages)
@@ -159,8 +174,8 @@ class Training:
             (config.cull_support_at, self._cull_support),
             (config.cull_opacity_at, self._cull_opacity),
         ):
-            for share in shares:
-                actions.setdefault(max(round(share * self.total), 1), []).append(action)
+            for step in sorted({max(round(share * self.total), 1) for share in shares}):
+                actions.setdefault(step, []).append(action)
         return actions
 
     def _control_density(self, step):
@@ -179,7 +194,7 @@ class Training:
             )
         self.splatter.load(population.gaussians, (population.first_moments, population.second_moments))
         self.neighbors_at = None
-        self.settling = Settling(len(self.views))  # a cull makes the loss jump
+        self.settling = Settling(self.visited)  # a cull makes the loss jump
 
     def _duplicate(self, population):
         config = self.config.density
