@@ -17,9 +17,8 @@ class NeighborFields:
         self.capacity, self.k = capacity, k
         self.indices = ti.field(ti.i32, shape=(capacity, k))
         self.means = ti.Vector.field(3, real, shape=(capacity, k), needs_grad=True)
-        self.user_starts = ti.field(
-            ti.i32, shape=capacity + 1
-        )  # users of i: users[user_starts[i] : user_starts[i + 1]]
+        # Who uses i: users[user_starts[i] : user_starts[i + 1]].
+        self.user_starts = ti.field(ti.i32, shape=capacity + 1)
         self.users = ti.field(ti.i32, shape=capacity * k)  # flat positions into (capacity, k)
 
     def load(self, neighbors):
@@ -57,12 +56,12 @@ def make_regularizers(gaussians, neighbors, loss):
     @ti.kernel
     def gather(count: ti.i32):
         for i in range(count):
-            total = ti.Vector.zero(gaussians.real, 3)
+            pulls = ti.Vector.zero(gaussians.real, 3)
             for position in range(user_starts[i], user_starts[i + 1]):
                 user = users[position]
-                total += neighbor_means.grad[user // k, user % k]
+                pulls += neighbor_means.grad[user // k, user % k]
                 neighbor_means.grad[user // k, user % k] = ti.Vector.zero(gaussians.real, 3)
-            means.grad[i] += total
+            means.grad[i] += pulls
 
     @ti.ad.grad_replaced
     def copy_neighbors(count):

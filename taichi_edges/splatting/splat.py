@@ -8,7 +8,7 @@ plane of its own (`product`); on a GPU all add log(1 - a) into one with atomics 
 T and compared with the edge map. Backward: each Gaussian gathers dL/da_i = -T dL/dT / (1 - a_i) from the same pixels,
 nothing is written twice, so there are no atomics; Taichi's own adjoint of the projection takes it to the parameters.
 
-A launch that wakes a second thread costs as much as 700 Gaussians, so what can be one kernel is one.
+A launch that wakes a second thread costs as much as several hundred Gaussians, so what can be one kernel is one.
 """
 
 import taichi as ti

@@ -87,9 +87,8 @@ class Splatter:
         self.cameras = CameraFields(np.asarray(intrinsics), np.asarray(world_to_camera), real)
         height, width = self.images.height, self.images.width
         balanced = loss == "balanced"
-        slots = round_capacity(
-            min(2 * int(self.images.edge_counts.max()), height * width) if balanced else height * width
-        )
+        most = min(2 * int(self.images.edge_counts.max()), height * width) if balanced else height * width
+        slots = round_capacity(most)
         pages, planes = PAGES if balanced else 1, threads if schedule == "product" else 1
         self.selection = PixelSelection(height, width, slots, pages, planes, real)
         self.loss = ti.ndarray(real, shape=(), needs_grad=True)  # a field would take the tape two launches to reset
@@ -138,10 +137,8 @@ class Splatter:
 
     def weights(self, page):
         """Weights of an edge pixel and of a background pixel of a page in the loss."""
-        pixel_count, edges = (
-            self.images.height * self.images.width,
-            int(self.images.edge_counts[self.selection.views[page]]),
-        )
+        pixel_count = self.images.height * self.images.width
+        edges = int(self.images.edge_counts[self.selection.views[page]])
         if self.loss_mode == "class_weighted":
             return 0.5 / max(edges, 1), 0.5 / max(pixel_count - edges, 1)
         return (1.0 / max(int(self.selection.counts[page]), 1),) * 2
