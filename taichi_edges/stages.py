@@ -33,7 +33,7 @@ def prepare(run):
     folder = run.data_path(source.path, "source.path")
     frames = READERS[source.reader](folder, source)
     views = build_views(frames, source, run.config.box, run.progress, run.threads)
-    views, facts = _with_thin_lines(views, source, run.config.train.edge_threshold, run.threads)
+    views, facts = _with_edgels(views, source, run.config.train.edge_threshold, run.threads)
     write_views(run.path("views.npz"), views)
     size = {"width_px": views.width, "height_px": views.height}
     return {"views": len(views), **size, **facts, "files": _copy_points(run)}
@@ -52,15 +52,16 @@ def _copy_points(run):
     return ["seeds.ply"]
 
 
-def _with_thin_lines(views, source, edge_threshold, threads):
-    """The views with their edge maps thinned, if the scene wants that, and the width the lines had before."""
-    from taichi_edges.detectors.ridges import thin_edge_maps
+def _with_edgels(views, source, edge_threshold, threads):
+    """The views with the edgels of their edge maps, redrawn through them if the scene wants that; and the facts."""
+    from taichi_edges.detectors.drawing import draw_edge_maps
+    from taichi_edges.detectors.ridges import trace_ridges
     from taichi_edges.support import line_width
 
     width, _ = line_width(views, edge_threshold)
-    if source.thin:
-        views = replace(views, edge_maps=thin_edge_maps(views.edge_maps, width, source.thin_threshold, threads))
-    return views, {"line_width_px": round(width, 2)}
+    edgels = trace_ridges(views.edge_maps, width, source.thin_threshold, threads)
+    edge_maps = draw_edge_maps(edgels, views.height, views.width, threads) if source.thin else views.edge_maps
+    return replace(views, edge_maps=edge_maps, edgels=edgels), {"line_width_px": round(width, 2)}
 
 
 def _prepare_synthetic(run):
@@ -84,7 +85,7 @@ def _prepare_synthetic(run):
     for file, picture in zip(files, pictures, strict=True):
         with replacing(run.path(file)) as unfinished:
             unfinished.write_bytes(cv2.imencode(".png", picture[:, :, ::-1])[1])
-    views, facts = _with_thin_lines(views, source, run.config.train.edge_threshold, run.threads)
+    views, facts = _with_edgels(views, source, run.config.train.edge_threshold, run.threads)
     views = replace(views, image_paths=tuple(files))
     write_edges(run.path("truth.json"), part.edges, {"part": part.name})
     write_views(run.path("views.npz"), views)

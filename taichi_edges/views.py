@@ -8,6 +8,9 @@ import numpy as np
 
 from taichi_edges.artefacts import file_state, replacing
 from taichi_edges.cameras import Similarity, project
+from taichi_edges.edgels import Edgels
+
+EDGEL_ARRAYS = ("starts", "points", "normals", "strengths")  # the fields of Edgels, in order
 
 
 @dataclass(frozen=True)
@@ -22,6 +25,7 @@ class Views:
     similarity:       input frame -> unit cube.
     box:              (2, 3) the scene box in the unit cube.
     input_to_truth:   (4, 4) input frame -> frame of the ground truth (EMAP's `worldtogt`).
+    edgels:           Edgels, the sub-pixel points through which the edge maps are drawn; None before they are traced.
     """
 
     names: tuple
@@ -32,12 +36,14 @@ class Views:
     similarity: Similarity = Similarity()
     box: np.ndarray = field(default_factory=lambda: np.array([[0.0, 0, 0], [1, 1, 1]]))
     input_to_truth: np.ndarray = field(default_factory=lambda: np.eye(4))
+    edgels: Edgels | None = None
 
     def __post_init__(self):
         count, height, width = self.edge_maps.shape
         assert self.edge_maps.dtype == np.uint8, self.edge_maps.dtype
         assert len(self.names) == len(self.image_paths) == count and len(set(self.names)) == count
         assert self.intrinsics.shape == (count, 3, 3) and self.world_to_camera.shape == (count, 3, 4)
+        assert self.edgels is None or self.edgels.view_count == count
 
     def __len__(self):
         return len(self.names)
@@ -71,6 +77,7 @@ def write_views(path, views):
             similarity_offset=np.array(views.similarity.offset),
             box=views.box,
             input_to_truth=views.input_to_truth,
+            **{f"edgel_{name}": getattr(views.edgels, name) for name in EDGEL_ARRAYS if views.edgels is not None},
         )
     return path
 
@@ -92,7 +99,16 @@ def _views_of(path, _state):
             similarity=Similarity(float(archive["similarity_scale"]), tuple(archive["similarity_offset"].tolist())),
             box=archive["box"],
             input_to_truth=archive["input_to_truth"],
+            edgels=_edgels_of(archive),
         )
-    for array in (views.edge_maps, views.intrinsics, views.world_to_camera, views.box, views.input_to_truth):
+    arrays = [views.edge_maps, views.intrinsics, views.world_to_camera, views.box, views.input_to_truth]
+    arrays += [getattr(views.edgels, name) for name in EDGEL_ARRAYS if views.edgels is not None]
+    for array in arrays:
         array.setflags(write=False)
     return views
+
+
+def _edgels_of(archive):
+    if "edgel_starts" not in archive:
+        return None
+    return Edgels(*(archive[f"edgel_{name}"] for name in EDGEL_ARRAYS))

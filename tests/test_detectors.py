@@ -3,18 +3,22 @@
 import numpy as np
 import pytest
 
+from taichi_edges.detectors.drawing import DRAWN_SIGMA, PATCH, draw_edge_maps, draw_lines
 from taichi_edges.detectors.ridges import (
-    DRAWN_SIGMA,
-    PATCH,
-    draw_ridges,
     gaussian_derivatives,
     ridge_points,
-    thin_edge_maps,
+    trace_ridges,
 )
 from taichi_edges.support import line_width
 from taichi_edges.views import Views
 
 SIZE = 120
+
+
+def thinned(edge_maps, width_px, threshold, threads=None):
+    """The edge maps redrawn through their ridges."""
+    edgels = trace_ridges(edge_maps, width_px, threshold, threads)
+    return draw_edge_maps(edgels, *edge_maps.shape[1:], threads)
 
 
 def line_map(angle, width, centre=(60.3, 59.8), height=255):
@@ -60,7 +64,7 @@ def test_thinned_lines_have_one_width_whatever_the_detector_drew():
     for width in (2.4, 5.0, 8.0):
         edge_map, _ = line_map(0.35, width)
         measured, _ = line_width(views_of([edge_map]), 0.5)
-        thin = thin_edge_maps(edge_map[None], measured, 0.3)[0]
+        thin = thinned(edge_map[None], measured, 0.3)[0]
         across = (thin[30:-30, 30:-30] >= 128).sum(axis=0).mean() * np.cos(0.35)
         assert across == pytest.approx(2.355 * DRAWN_SIGMA, abs=0.6)
 
@@ -78,7 +82,7 @@ def test_faint_lines_are_dropped_and_strong_ones_stand_out():
     strong, _ = line_map(0.0, 3.0, (60, 30))
     weak, _ = line_map(0.0, 3.0, (60, 60), height=130)
     faint, _ = line_map(0.0, 3.0, (60, 90), height=60)
-    thin = thin_edge_maps(np.maximum(np.maximum(strong, weak), faint)[None], 3.0, 0.3)[0]
+    thin = thinned(np.maximum(np.maximum(strong, weak), faint)[None], 3.0, 0.3)[0]
     assert thin[30, 60] == pytest.approx(255, abs=3)
     assert thin[60, 60] == pytest.approx(255 * (0.5 + 0.5 * 130 / 255), abs=3)
     assert thin[85:95].max() == 0
@@ -87,8 +91,8 @@ def test_faint_lines_are_dropped_and_strong_ones_stand_out():
 def test_specks_leave_no_line_and_an_empty_map_stays_empty():
     edge_map = np.zeros((SIZE, SIZE), np.uint8)
     edge_map[40:42, 50:52] = 255
-    assert thin_edge_maps(edge_map[None], 2.4, 0.3).max() == 0
-    assert draw_ridges(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), 20, 30).shape == (20, 30)
+    assert thinned(edge_map[None], 2.4, 0.3).max() == 0
+    assert draw_lines(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), 20, 30).shape == (20, 30)
 
 
 def test_a_wide_dark_margin_moves_the_ridge_and_changes_nothing_else():
@@ -114,11 +118,11 @@ def test_drawn_ridges_match_a_pixel_by_pixel_drawing(generator):
                 across = away @ normal
                 beyond = max(away @ away - across**2 - 1, 0)
                 expected[row, column] = max(expected[row, column], value * np.exp(-0.5 * (across**2 + beyond)))
-    drawn = draw_ridges(points, normals, values, 30, 30, sigma=1.0)
+    drawn = draw_lines(points, normals, values, 30, 30, sigma=1.0)
     np.testing.assert_allclose(drawn, expected * 255, atol=0.501)
 
 
 def test_thinning_does_not_depend_on_the_threads():
     maps = np.stack([line_map(angle, 4.0)[0] for angle in np.linspace(0, 3, 7)])
-    expected = thin_edge_maps(maps, 4.0, 0.3, threads=1)
-    np.testing.assert_array_equal(thin_edge_maps(maps, 4.0, 0.3, threads=3), expected)
+    expected = thinned(maps, 4.0, 0.3, threads=1)
+    np.testing.assert_array_equal(thinned(maps, 4.0, 0.3, threads=3), expected)

@@ -7,7 +7,7 @@ import pytest
 import reference_support as reference
 
 from taichi_edges import support
-from taichi_edges.detectors.ridges import draw_ridges
+from taichi_edges.detectors.drawing import draw_lines
 from taichi_edges.kernels import evidence
 from taichi_edges.kernels.evidence import Evidence
 from taichi_edges.support import edge_strength, exclusive_support, line_width
@@ -37,7 +37,7 @@ def scene(*segments):
             inside = ((pixels > 0) & (pixels < SIZE - 1)).all(axis=1)
             points = pixels[inside]
             drawn = np.maximum(
-                drawn, draw_ridges(points, np.tile(normal, (len(points), 1)), np.ones(len(points)), SIZE, SIZE)
+                drawn, draw_lines(points, np.tile(normal, (len(points), 1)), np.ones(len(points)), SIZE, SIZE)
             )
         maps.append(drawn)
     return Views(views.names, np.stack(maps), intrinsics, poses, ("",) * VIEWS)

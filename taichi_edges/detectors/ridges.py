@@ -1,5 +1,5 @@
 """Centre lines of a detector's edge maps, at sub-pixel accuracy (Steger, "An unbiased detector of curvilinear
-structures", PAMI 1998), redrawn at one width.
+structures", PAMI 1998).
 
 A learned detector answers with bands of 2 to 10 pixels. Trained on a band, Gaussians settle anywhere in it, and a line
 is defined only up to its width. Its ridge is where the detector means the edge to be.
@@ -10,13 +10,12 @@ from concurrent.futures import ThreadPoolExecutor
 import cv2
 import numpy as np
 
+from taichi_edges.edgels import Edgels
+
 SIGMA_PER_WIDTH = 0.29  # 1 / (2 sqrt 3): the smallest scale at which a bar of that width has one ridge (Steger, eq. 17)
 MIN_SIGMA = 0.8  # px; below, the derivative of the Gaussian is not sampled well
-DRAWN_SIGMA = 1.0  # px; about what DexiNed draws (FWHM 2.4 px), wide enough to pull a Gaussian from 3 px away
 MIN_CURVATURE = 0.1  # of that of a line as narrow as the scale; on a flank rounding alone leaves a faint curvature
 MIN_PIXELS = 6  # a ridge of fewer is no line
-PATCH = 3  # px; half size of the patch in which a ridge point is drawn
-DRAWN_AT_ONCE = 256  # points; few enough that their patches stay in the cache and in memory that is there already
 
 
 def _reach(sigma):
@@ -87,44 +86,11 @@ def _without_specks(mask, rows, columns):
     return (labels > 0) & (np.bincount(labels) >= MIN_PIXELS)[labels]
 
 
-def draw_ridges(points, normals, values, height, width, sigma=DRAWN_SIGMA):
-    """(H, W) uint8 map of lines through the points: a Gaussian profile of `sigma` pixels across each, `value` high."""
-    image = np.zeros((height + 2 * PATCH, width + 2 * PATCH), np.float32)
-    for start in range(0, len(points), DRAWN_AT_ONCE):
-        part = slice(start, start + DRAWN_AT_ONCE)
-        _draw_patches(image, points[part], normals[part], values[part], sigma)
-    image *= 255
-    return np.rint(image, out=image)[PATCH:-PATCH, PATCH:-PATCH].astype(np.uint8)
+def trace_ridges(edge_maps, width_px, threshold, threads=None):
+    """Edgels on the ridges of edge maps, some of them at a time; strengths are the maps' values there.
 
-
-def _draw_patches(image, points, normals, values, sigma):
-    """Draw some of the ridge points into `image`, which is PATCH pixels larger on every side."""
-    centres = np.rint(points)
-    patch = np.arange(2 * PATCH + 1)  # pixels of `image`, and offsets from the point: (n, 1, 7) right, (n, 7, 1) down
-    right = (centres - points)[:, 0, None, None] + (patch - PATCH)
-    down = (centres - points)[:, 1, None, None] + (patch - PATCH)[:, None]
-    across_squared = (right * normals[:, 0, None, None] + down * normals[:, 1, None, None]) ** 2
-    along_squared = right**2 + down**2 - across_squared
-    # Each point draws its line no farther than to the next one, or a curve's chords would stand out.
-    profiles = np.exp(-0.5 * (across_squared + np.maximum(along_squared - 1.0, 0.0)) / sigma**2)
-    heights = (values[:, None, None] * profiles).astype(np.float32)
-    columns, rows = centres.astype(np.int64).T[:, :, None, None]
-    places = (rows + patch[:, None]) * image.shape[1] + columns + patch
-    np.maximum.at(image.reshape(-1), places.ravel(), heights.ravel())  # fast in one dimension and one type only
-
-
-def thin_edge_maps(edge_maps, width_px, threshold, threads=None):
-    """Edge maps reduced to their ridges and redrawn at one width, some of them at a time.
-
-    edge_maps: (V, H, W) uint8 with lines about `width_px` wide. threshold: 0..1; ridges with lower values are dropped,
-    the others are drawn from half to full height, so that all of them are edge pixels and the sure ones stand out.
+    edge_maps: (V, H, W) uint8 with lines about `width_px` wide. threshold: 0..1; ridges with lower values are dropped.
     """
     sigma = max(MIN_SIGMA, SIGMA_PER_WIDTH * width_px)
-    height, width = edge_maps.shape[1:]
-
-    def thin(edge_map):
-        points, normals, values = ridge_points(edge_map, sigma, threshold)
-        return draw_ridges(points, normals, 0.5 + 0.5 * values, height, width)
-
     with ThreadPoolExecutor(threads) as pool:  # OpenCV and NumPy release the lock in the long loops
-        return np.stack(list(pool.map(thin, edge_maps)))
+        return Edgels.of_views(pool.map(lambda edge_map: ridge_points(edge_map, sigma, threshold), edge_maps))

@@ -1,0 +1,65 @@
+"""Edgels: edge elements, the sub-pixel points of 2D edges with the direction across each.
+
+Whatever detects edges gives edgels; the edge maps that the splatting learns from are drawn through them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Edgels:
+    """The edgels of V views, one view after the other.
+
+    starts:    (V + 1,) int64; those of view v are starts[v] .. starts[v + 1] - 1.
+    points:    (n, 2) float32 pixels (u, v), centres at integers.
+    normals:   (n, 2) float32 unit vectors across the edge, sign arbitrary.
+    strengths: (n,) float32 in 0..1: how sure the detector is.
+    """
+
+    starts: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+    strengths: np.ndarray
+
+    def __post_init__(self):
+        count = len(self.points)
+        assert self.points.shape == self.normals.shape == (count, 2) and self.strengths.shape == (count,)
+        assert self.starts[0] == 0 and self.starts[-1] == count, self.starts
+
+    @staticmethod
+    def of_views(views):
+        """From an iterable with (points, normals, strengths) for each view."""
+        columns = list(zip(*views, strict=True)) or [[], [], []]
+        starts = np.concatenate([[0], np.cumsum([len(points) for points in columns[0]])]).astype(np.int64)
+        shapes = ((0, 2), (0, 2), (0,))
+        joined = (np.concatenate([np.zeros(shape), *column]) for shape, column in zip(shapes, columns, strict=True))
+        return Edgels(starts, *(np.ascontiguousarray(array, np.float32) for array in joined))
+
+    @property
+    def view_count(self):
+        """Number of views, those without an edgel included."""
+        return len(self.starts) - 1
+
+    @property
+    def views(self):
+        """(n,) int64: the view of each edgel."""
+        return np.repeat(np.arange(self.view_count), np.diff(self.starts))
+
+    def __len__(self):
+        return len(self.points)
+
+    def of_view(self, view):
+        """Points (m, 2), normals (m, 2) and strengths (m,) of one view."""
+        part = slice(self.starts[view], self.starts[view + 1])
+        return self.points[part], self.normals[part], self.strengths[part]
+
+    def keep(self, chosen):
+        """Only the chosen edgels. chosen: (n,) bool."""
+        before = np.concatenate([[0], np.cumsum(chosen)]).astype(np.int64)
+        return Edgels(before[self.starts], self.points[chosen], self.normals[chosen], self.strengths[chosen])
+
+    def moved(self, offsets):
+        """The same edgels, their points moved by (n, 2) pixels."""
+        return Edgels(self.starts, (self.points + offsets).astype(np.float32), self.normals, self.strengths)
