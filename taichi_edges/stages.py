@@ -176,9 +176,9 @@ def cluster(run):
     views = read_views(run.path("views.npz"))
     gaussians = Gaussians(*read_gaussians(run.path("gaussians.ply")))
     means = views.similarity.to_unit(gaussians.means.astype(np.float64))
-    threshold = run.config.train.edge_threshold
+    threshold, generator = run.config.train.edge_threshold, np.random.default_rng(run.config.seed)
     points, directions, counts = filter_points(
-        means, gaussians.directions(), gaussians.opacities, views, run.config.filter, threshold
+        means, gaussians.directions(), gaussians.opacities, views, run.config.filter, threshold, generator
     )
     if len(points) == 0:
         problem = f"none of {len(means)} Gaussians passed the filters ({_in_words(asdict(counts))})"

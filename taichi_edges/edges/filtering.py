@@ -1,45 +1,126 @@
-"""From trained Gaussians to oriented points: which centres are trusted (paper 3.3 and release)."""
+"""From trained Gaussians to oriented points: which centres are trusted (paper 3.3 and release), and where they belong.
 
-from dataclasses import dataclass
+With `filter.refine` a centre is a first guess. It moves to where the viewing planes of its edgels meet, must explain
+edgels that nothing else explains, and must stay on them as the viewpoint moves. What edgels are left over are voted on
+once more, for edges seen in few views; and all is grown along its tangents.
+"""
+
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from taichi_edges.support import exclusive_support
+
+AROUND = 9  # points, itself included, over which the steadiness of a point is a median
+LEAST_VIEWS = 3.0  # of an edge seen in few views; two planes always meet
+HARVEST_KEEP = 0.06  # share of the views that must see one of the edges left over
 
 
 @dataclass(frozen=True)
 class FilterCounts:
-    """How many Gaussians came in and how many each filter took away, in this order."""
+    """How many Gaussians came in, how many points each filter took away, and how many were found beyond them."""
 
     gaussians: int
     low_opacity: int
     low_support: int
-    outliers: int
+    unsteady: int = 0
+    harvested: int = 0
+    grown: int = 0
+    outliers: int = 0
 
 
-def filter_points(means, directions, opacities, views, config, edge_threshold):
-    """The centres that are opaque, supported by the edge maps and not isolated.
+def filter_points(means, directions, opacities, views, config, edge_threshold, generator):
+    """The centres that are opaque, supported by the edge maps and not isolated; refined if the scene wants that.
 
     means: (n, 3) unit cube. directions: (n, 3) unit vectors. opacities: (n,). config: the scene's `filter` section.
-    Support counts, among the views that have the point in front of the camera (z > 0) and inside the image, those in
-    which it falls on an edge pixel that is not explained by a better point elsewhere (`exclusive_support`); that an
-    edge is hidden in many views is why the share asked for is small. ti.init must have been called.
+    generator: numpy.random.Generator, for what is left to chance in the harvest. ti.init must have been called.
     Returns points (m, 3) float64, directions (m, 3) float64 and FilterCounts.
     """
-    points = np.asarray(means, dtype=np.float64)
     opaque = np.asarray(opacities) >= config.min_opacity
-    supported = opaque.copy()
-    support = exclusive_support(views, points[opaque], edge_threshold)
-    supported[opaque] = (support >= config.min_support) & (support > 0)
-    kept = np.flatnonzero(supported)
-    inliers = kept[statistical_inliers(points[kept], config.outlier_neighbors, config.outlier_deviations)]
+    points, directions = (np.asarray(array, dtype=np.float64)[opaque] for array in (means, directions))
+    if config.refine:
+        points, directions, counts = refined_points(points, directions, views, config, edge_threshold, generator)
+    else:
+        on_edges = _on_edge_pixels(points, views, config.min_support, edge_threshold)
+        points, directions, counts = points[on_edges], directions[on_edges], {"low_support": int((~on_edges).sum())}
+    inliers = statistical_inliers(points, config.outlier_neighbors, config.outlier_deviations)
     counts = FilterCounts(
-        gaussians=len(points),
+        gaussians=len(opaque),
         low_opacity=int((~opaque).sum()),
-        low_support=int(opaque.sum() - supported.sum()),
-        outliers=len(kept) - len(inliers),
+        **counts,
+        outliers=len(points) - len(inliers),
     )
-    return points[inliers], np.asarray(directions, dtype=np.float64)[inliers], counts
+    return points[inliers], directions[inliers], counts
+
+
+def _on_edge_pixels(points, views, least, edge_threshold):
+    """(n,) bool: which points fall on edge pixels of their own in this share of the views that could see them.
+
+    Those are the views that have a point in front of the camera and inside the image; that an edge is hidden in many of
+    them is why the share asked for is small.
+    """
+    support = exclusive_support(views, points, edge_threshold)
+    return (support >= least) & (support > 0)
+
+
+def refined_points(points, directions, views, config, edge_threshold, generator):
+    """Points on the edges that the edgels of the views agree on. Arguments as for `filter_points`.
+
+    Returns points, directions and the counts of FilterCounts that this is about.
+    """
+    from taichi_edges.edges.growing import grow_points
+    from taichi_edges.kernels.edgel_matching import EdgelMatching
+    from taichi_edges.viewing_planes import refine_points
+
+    matching = EdgelMatching(views)
+    found = refine_points(matching, points, directions)
+    supported, steady = judge(matching, found, config)
+    refined, sizes = found.keep(steady), [len(found), supported.sum(), steady.sum()]
+    if config.harvest:  # what an unsteady point explains is a contour, and no edge is to be looked for in it
+        refined = refined.joined(harvest(matching, found.keep(supported), views, config, edge_threshold, generator))
+    sizes.append(len(refined))
+    if config.grow:
+        refined = grow_points(matching, refined, config.grow)
+    supported, steady = judge(matching, refined, config)
+    sizes += [len(refined), supported.sum(), steady.sum()]
+    weak, unsteady, harvested, grown, weak_later, unsteady_later = np.abs(np.diff(sizes)).tolist()
+    counts = {"low_support": weak + weak_later, "unsteady": unsteady + unsteady_later}
+    refined = refined.keep(steady)
+    return refined.points, refined.directions, {**counts, "harvested": harvested, "grown": grown}
+
+
+def judge(matching, refined, config):
+    """(n,) bool: which RefinedPoints have edgels of their own; and which of these stay on them as the viewpoint moves.
+
+    An occluding contour does not: its support comes from views that happen to look from similar directions. Steadiness
+    is a matter of an edge and not of a point, so the median of a neighbourhood decides.
+    """
+    from taichi_edges.explaining import explain
+
+    explained = explain(matching, refined)
+    supported = (explained.support >= config.min_support) & (refined.views >= LEAST_VIEWS)
+    steady, places = supported.copy(), refined.points[supported]
+    if len(places):
+        around = cKDTree(places).query(places, min(AROUND, len(places)))[1].reshape(len(places), -1)
+        steady[supported] = np.median(explained.steadiness[supported][around], axis=1) >= config.min_steadiness
+    return supported, steady
+
+
+def harvest(matching, refined, views, config, edge_threshold, generator):
+    """RefinedPoints on edges that few views see, voted for by the edgels that the `refined` ones leave unexplained."""
+    from taichi_edges.detectors.drawing import draw_edge_maps
+    from taichi_edges.explaining import unexplained
+    from taichi_edges.kernels.edgel_matching import EdgelMatching
+    from taichi_edges.splatting.voting import vote_seeds
+    from taichi_edges.viewing_planes import refine_points
+
+    left = views.edgels.keep(unexplained(matching, refined))
+    left = replace(views, edgels=left, edge_maps=draw_edge_maps(left, views.height, views.width))
+    seeds = vote_seeds(left, edge_threshold, generator, keep=HARVEST_KEEP)
+    matching = EdgelMatching(left)
+    found = refine_points(matching, seeds.points, seeds.directions)
+    return found.keep(judge(matching, found, config)[1])
 
 
 def statistical_inliers(points, neighbors, deviations):

@@ -15,7 +15,7 @@ MIN_STRETCH = 5  # points; a line through fewer says nothing
 LINE_PRICE, CURVE_PRICE = 5, 8  # free parameters: a line and where it ends; a circular arc and where it starts and ends
 OUTLIER = 9.0  # squared residuals in units of the noise count up to here
 NOISE_WINDOW = 10  # points on which a quadratic measures the local scatter
-MIN_NOISE = 1e-3  # unit-cube units; detectors' errors vary slowly along an edge, so the scatter alone is too small
+MIN_NOISE = 7e-4  # unit-cube units; detectors' errors vary slowly along an edge, so the scatter alone is too small
 BLOCK = 1 << 13  # points of overlapping stretches that are looked at in one go; the intermediate arrays stay in cache
 
 

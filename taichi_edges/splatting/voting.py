@@ -155,14 +155,15 @@ def add_scores(
                 scores[i] = scores[i] + falloff[distance]
 
 
-def vote_seeds(views, threshold, generator, most=None):
+def vote_seeds(views, threshold, generator, most=None, keep=KEEP):
     """Seeds of the whole scene box, at most so many, drawn at random. ti.init must have been called.
 
-    threshold: of full scale. generator: jitters the finest cells, and draws.
+    threshold: of full scale. generator: jitters the finest cells, and draws. keep: share of the views that must see an
+    edge in a cell.
     """
     pixel = pixel_size(views)
     distances = DistanceBatches(views.edge_maps, threshold)
-    cells, size = vote_cells(views, distances, pixel)
+    cells, size = vote_cells(views, distances, pixel, keep)
     points, scores = score_cells(views, distances, cells, size, generator)
     points = points[nearly_best(points, scores, SUPPRESS_PX * pixel)]
     points = points[exclusive_support(views, points, threshold) >= LEAST_SUPPORT]
@@ -172,7 +173,7 @@ def vote_seeds(views, threshold, generator, most=None):
     return Seeds(chosen, line_directions(chosen, points, ALONG_PX * pixel), pixel)
 
 
-def vote_cells(views, distances, pixel):
+def vote_cells(views, distances, pixel, keep=KEEP):
     """The finest cells in which enough views see an edge, and their size, unit-cube units.
 
     Cells are (n, 3) int32, counted from the first corner of the box. pixel: size of a pixel, unit-cube units.
@@ -183,17 +184,17 @@ def vote_cells(views, distances, pixel):
         levels += 1
     size = pixel * FINEST_PX * 2 ** (levels - 1)
     cells = np.indices(np.ceil(extent / size).astype(int), np.int32).reshape(3, -1).T
-    cells = cells[np.flatnonzero(see_edges(views, distances, cells, 0, size))]
+    cells = cells[np.flatnonzero(see_edges(views, distances, cells, 0, size, keep))]
     for _ in range(levels - 1):
         if 8 * len(cells) > MOST_CELLS:
             break
         size /= 2
-        kept = np.flatnonzero(see_edges(views, distances, cells, 1, size))
+        kept = np.flatnonzero(see_edges(views, distances, cells, 1, size, keep))
         cells = 2 * cells[kept >> 3] + EIGHTHS[kept & 7]
     return cells, size
 
 
-def see_edges(views, distances, cells, split, size):
+def see_edges(views, distances, cells, split, size, keep=KEEP):
     """(n,) bool, or (8 n,) where they are `split` in eighths: whether enough views see an edge in a cell.
 
     That is, within the projected radius of its circumscribed sphere. cells: (n, 3). size: of one after the split.
@@ -202,7 +203,7 @@ def see_edges(views, distances, cells, split, size):
     if len(cells) == 0:
         return near > 0
     near, cells = device.upload(near), device.upload(cells)
-    needed = int(np.ceil(KEEP * len(views) - 1e-9))
+    needed = int(np.ceil(keep * len(views) - 1e-9))
     radius = STEPS_PER_PIXEL * float(np.median(views.intrinsics[:, 0, 0])) * size * HALF_DIAGONAL
     centres = np.vstack([np.column_stack([size * np.eye(3), views.box[0] + size / 2]), [0, 0, 0, 1]])  # of the cells
     projections = (views.intrinsics @ views.world_to_camera @ centres).astype(np.float32)

@@ -1,0 +1,65 @@
+"""Growing: oriented points continued along their tangents, as long as the views support it.
+
+Seeds are sparse where an edge is faint or often hidden. What is found of it tells where it goes on.
+"""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from taichi_edges.viewing_planes import refine_points
+
+STEP_PX = 1.0  # of a step along the tangent
+RADII_PX = (1.5, 1.0, 1.0)  # of the refinement of a step
+COVERED, TOO_CLOSE = 0.6, 0.5  # steps; no proposal is made, and no point kept, so near to one that is there
+STRAYED = 0.7  # steps; a point that the refinement moves farther has jumped to something else
+LEAST_COSINE = 0.8  # between the directions before and after a step
+LEAST_VIEWS = 3.0  # a place is where three planes meet, or it is anywhere
+MOST_ROUNDS = 200
+
+
+def grow_points(matching, refined, least_support):
+    """RefinedPoints and the points that continue them, each the step after another.
+
+    matching: EdgelMatching. least_support: share of the views that a new point needs.
+    """
+    step, newest = STEP_PX * matching.pixel, refined
+    for _ in range(MOST_ROUNDS):
+        if len(newest) == 0:
+            break
+        tree = cKDTree(refined.points)
+        newest = _next_points(matching, newest, tree, step, least_support)
+        refined = refined.joined(newest)
+    return refined
+
+
+def _next_points(matching, newest, tree, step, least_support):
+    """The refined points one step on from the `newest` ones, both ways, where there is nothing yet."""
+    ahead = np.concatenate([newest.points + step * newest.directions, newest.points - step * newest.directions])
+    directions = np.tile(newest.directions, (2, 1))
+    free = tree.query(ahead)[0] > COVERED * step
+    ahead, directions = _one_for_each_cell(ahead[free], directions[free], TOO_CLOSE * step)
+    found = refine_points(matching, ahead, directions, RADII_PX)
+    good = (found.support >= least_support) & (found.views >= LEAST_VIEWS)
+    good &= np.linalg.norm(found.points - ahead, axis=1) <= STRAYED * step
+    good &= np.abs((found.directions * directions).sum(axis=1)) >= LEAST_COSINE
+    good[good] = tree.query(found.points[good])[0] > TOO_CLOSE * step
+    found = found.keep(good)
+    return found.keep(_best_apart(found, TOO_CLOSE * step))
+
+
+def _one_for_each_cell(points, directions, size):
+    """The first of the points in each cubic cell, with its direction."""
+    cells = np.floor(points / size).astype(np.int64)
+    first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
+    return points[first], directions[first]
+
+
+def _best_apart(found, distance):
+    """(n,) bool: of points that are closer than `distance` the better supported ones."""
+    kept = np.ones(len(found), bool)
+    if len(found) < 2:
+        return kept
+    for one, other in sorted(cKDTree(found.points).query_pairs(distance)):
+        if kept[one] and kept[other]:
+            kept[other if found.support[other] <= found.support[one] else one] = False
+    return kept

@@ -1,0 +1,110 @@
+"""Explaining away: an edgel that one 3D edge explains does not support another.
+
+A stray point that projects onto the lines of other edges has support in many views, and none of it is its own. An
+occluding contour has edgels of its own, but moves with the viewpoint: they lie all around its projections, not on them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+ROUNDS = 4  # owners whose own support turns out weak lose their edgels in the next round
+MATCH_PX = 1.0  # a point explains an edgel within this distance
+NEAR_PX = 3.0  # an edgel within this distance, and nobody else's, should lie on the point if that is on an edge
+BESIDE_PX, ALONG_PX = 2.0, 8.0  # a point so near to the owner, across and along its direction, is on the same edge
+TIGHT_PX, TIGHT_NOISES = 0.25, 2.0  # residuals of an edge: within the first, or within so many times the maps' noise
+BEST_SUPPORTED = 0.2  # share of the points whose residuals tell the noise; those of stray points and contours do not
+NOISE_PER_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute value
+VIEWS_AT_ONCE = 16
+
+
+@dataclass(frozen=True)
+class Explained:
+    """What edgels say about points when each of them counts for one edge alone.
+
+    support: (n,) share of the views that have a point in the image in which it lies on an edgel of its own edge.
+    steadiness: (n,) of the edgels near a point's projections that no other edge explains, the share that lies on them.
+    noise_px: standard deviation across the edge of the edgels of the best-supported points.
+    """
+
+    support: np.ndarray
+    steadiness: np.ndarray
+    noise_px: float
+
+
+def explain(matching, refined):
+    """Explained for `RefinedPoints`. matching: EdgelMatching.
+
+    The strongest point owns an edgel it lies on, with its neighbours along the line; a point beside the owner, on the
+    same edge in 3D, shares it. Strength is the support, then what a point was found to own in the round before.
+    """
+    owned, count = refined.support, len(refined)
+    for _ in range(ROUNDS):
+        owners = _owners(matching, refined, owned + 1e-3 * refined.support)
+        shared, seen = np.zeros(count), np.zeros(count)
+        for some, matches, _, inside in _in_parts(matching, refined, MATCH_PX):
+            shared += (_whose(matching, refined, owners, some, matches) > 0).sum(axis=1)
+            seen += inside.sum(axis=1)
+        owned = shared / np.maximum(seen, 1)
+    noise = _noise(matching, refined, owned)
+    return Explained(owned, _steadiness(matching, refined, owners, max(TIGHT_PX, TIGHT_NOISES * noise)), noise)
+
+
+def unexplained(matching, refined):
+    """(e,) bool: the edgels that none of the RefinedPoints, all of them trusted, lies on."""
+    return _owners(matching, refined, refined.support) < 0
+
+
+def _in_parts(matching, refined, radius):
+    """(slice of the views, matches, residuals, inside) of `EdgelMatching.matches`, some views at a time."""
+    count = matching.edgels.view_count
+    for first in range(0, count, VIEWS_AT_ONCE):
+        some = slice(first, min(first + VIEWS_AT_ONCE, count))
+        yield some, *matching.matches(refined.points, refined.directions, some, radius)
+
+
+def _owners(matching, refined, strength):
+    """(e,) index of the strongest point on each edgel or on one of its neighbours, -1 where there is none."""
+    order = np.argsort(strength, kind="stable")
+    ranks = np.empty(len(refined), np.int64)
+    ranks[order] = np.arange(len(refined))
+    best = np.full(len(matching.edgels), -1)
+    for _, matches, _, _ in _in_parts(matching, refined, MATCH_PX):
+        at, column = np.nonzero(matches >= 0)
+        np.maximum.at(best, matches[at, column], ranks[at])
+    best = best[matching.neighbors].max(axis=1, initial=-1)
+    return np.append(order, -1)[best]
+
+
+def _whose(matching, refined, owners, some, matches):
+    """(n, v) int: 1 where the matched edgel is the point's own, -1 where it is another edge's, 0 no edgel or owner."""
+    whose = np.zeros(matches.shape, np.int8)
+    at, column = np.nonzero(matches >= 0)
+    owner = owners[matches[at, column]]
+    at, column, owner = at[owner >= 0], column[owner >= 0], owner[owner >= 0]
+    apart, direction = refined.points[owner] - refined.points[at], refined.directions[at]
+    along = (apart * direction).sum(axis=1)
+    across = np.linalg.norm(apart - along[:, None] * direction, axis=1)
+    reach = matching.pixel * np.array([BESIDE_PX, ALONG_PX])
+    whose[at, column] = np.where((across <= reach[0]) & (np.abs(along) <= reach[1]), 1, -1)
+    return whose
+
+
+def _noise(matching, refined, owned):
+    """Standard deviation, px, of the residuals of the best-supported points."""
+    if len(refined) == 0:
+        return 0.0
+    best = refined.keep(owned >= np.quantile(owned, 1 - BEST_SUPPORTED))
+    residuals = [found[matches >= 0] for _, matches, found, _ in _in_parts(matching, best, MATCH_PX)]
+    residuals = np.concatenate(residuals)
+    return float(NOISE_PER_MEDIAN * np.median(np.abs(residuals))) if len(residuals) else 0.0
+
+
+def _steadiness(matching, refined, owners, tight):
+    """(n,) see Explained. tight: px."""
+    on, near = np.zeros(len(refined)), np.zeros(len(refined))
+    for some, matches, residuals, _ in _in_parts(matching, refined, NEAR_PX):
+        counted = (matches >= 0) & (_whose(matching, refined, owners, some, matches) >= 0)
+        near += counted.sum(axis=1)
+        on += (counted & (np.abs(residuals) <= tight)).sum(axis=1)
+    return on / np.maximum(near, 1)
