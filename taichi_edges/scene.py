@@ -115,7 +115,7 @@ class FilterConfig(Section):
         0.55, description="refine: of the edgels near a point that nothing else explains, the share that lie on it"
     )
     harvest: bool = Field(True, description="refine: look once more for edges seen in few views")
-    grow: Share = Field(0.15, description="refine: continue edges where this share of the views agrees; 0: do not")
+    grow: Share = Field(0.2, description="refine: continue edges where this share of the views agrees; 0: do not")
     outlier_neighbors: Annotated[int, Field(ge=0)] = Field(3, description="statistical outliers: neighbours; 0: off")
     outlier_deviations: Positive = Field(5.0, description="mean neighbour distance allowed, standard deviations")
 
