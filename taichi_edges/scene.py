@@ -5,7 +5,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PlainValidator, field_validator, model_validator
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0)]
@@ -15,10 +15,22 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 Point = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
+MOST_BIAS = 20.0  # px; a map that is farther off belongs to another image
+
+
 class Section(BaseModel):
     """A part of the scene file: frozen, strict about types, no unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class OnnxConfig(Section):
+    """A learned detector from an ONNX file, with `source.detector: onnx`."""
+
+    model: str = Field("", description="the ONNX file, relative to the data root or absolute")
+    network: str = Field("", description="which network it is, e.g. pidinet; '': as the file's name says")
+    scale: Annotated[float, Field(gt=0, le=4)] = Field(1.0, description="the network sees the image so much larger")
+    flip: bool | Literal["both"] = Field(False, description="average with the mirrored image; both: in both directions")
 
 
 class SourceConfig(Section):
@@ -26,8 +38,12 @@ class SourceConfig(Section):
 
     reader: Literal["nerf", "emap", "synthetic"] = Field("emap", description="layout of the folder, see README")
     path: str = Field("", description="folder, relative to the data root (--data or TAICHI_EDGES_DATA) or absolute")
-    edges: str = Field("", description="folder of the edge maps inside `path`, e.g. edge_DexiNed")
-    images: str = Field("", description="folder of the colour images inside `path`; optional, for the overlays")
+    edges: str = Field("", description="folder of ready edge maps inside `path`, e.g. edge_DexiNed")
+    images: str = Field("", description="folder of the colour images inside `path`; '': where the layout has them")
+    detector: Literal["auto", "maps", "subpixel", "onnx"] = Field(
+        "auto", description="ready maps, our own detector, or a network; auto: maps if `edges` is given, else subpixel"
+    )
+    onnx: OnnxConfig = Field(default_factory=lambda: OnnxConfig())
     split: str = Field("train", description="nerf: which transforms_<split>.json")
     axes: Literal["auto", "opengl", "opencv"] = Field("auto", description="camera axes; auto: what the layout means")
     points: str = Field("", description="point cloud to start from with train.seeds: points; relative to the data root")
@@ -37,6 +53,40 @@ class SourceConfig(Section):
     part: str = Field("demo", description="synthetic: which of the generator's parts")
     views: Count = Field(30, description="synthetic: number of views")
     size: Annotated[int, Field(ge=16)] = Field(400, description="synthetic: width and height of the views, pixels")
+
+
+def _measured_or(given, what):
+    """A validator that lets 'auto', 'off' (YAML reads it as false) and what `given` accepts pass."""
+
+    def check(value):
+        if value is False or value == "off":
+            return "off"
+        if value is True or value == "auto":
+            return "auto"
+        if not given(value):
+            raise ValueError(f"must be auto, off or {what}")
+        return value
+
+    return PlainValidator(check)
+
+
+def _is_length(value):
+    return type(value) in (int, float) and abs(value) < MOST_BIAS
+
+
+def _is_shift(value):
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_length, value))
+
+
+class CalibrationConfig(Section):
+    """Biases of ready or learned edge maps, see detectors/calibration.py. `calibration: off` switches both off."""
+
+    shift: Annotated[str | list[float], _measured_or(_is_shift, "[right, down] in pixels")] = Field(
+        "auto", description="by which the maps are shifted against the images: measured, [right, down] px, or off"
+    )
+    silhouette: Annotated[str | float, _measured_or(_is_length, "a number of pixels")] = Field(
+        "auto", description="by which silhouettes lie outside the true ones: measured, px, or off"
+    )
 
 
 class LearningRates(Section):
@@ -153,11 +203,19 @@ class SceneConfig(Section):
         [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], description="opposite corners of the scene, input units"
     )
     source: SourceConfig = SourceConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
     train: TrainConfig = TrainConfig()
     filter: FilterConfig = FilterConfig()
     cluster: ClusterConfig = ClusterConfig()
     fit: FitConfig = FitConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
+
+    @field_validator("calibration", mode="before")
+    @classmethod
+    def _all_or_nothing(cls, value):
+        if value is False or value == "off":
+            return {"shift": "off", "silhouette": "off"}
+        return {} if value is True or value == "auto" else value
 
     @field_validator("box")
     @classmethod
@@ -172,6 +230,8 @@ class SceneConfig(Section):
             raise ValueError("source.path is missing; set it to the folder with the images and cameras")
         if self.train.seeds == "points" and not self.source.points:
             raise ValueError("train.seeds is 'points', but source.points names no file to take them from")
+        if self.source.detector == "onnx" and not self.source.onnx.model:
+            raise ValueError("source.detector is 'onnx', but source.onnx.model names no ONNX file")
         return self
 
 
@@ -199,7 +259,9 @@ PRESETS = {
             "shape_weight": 0.1,
             "neighbors": 4,
             "density": DensityConfig().model_dump(),  # the paper leaves the intervals open
-        }
+        },
+        "calibration": {"shift": "off", "silhouette": "off"},
+        "filter": {"refine": False},
     },
     # Seeded where the views agree, so that a few passes are enough: faster rates, one smooth decay, no duplication.
     "fast": {
@@ -223,6 +285,8 @@ PRESETS = {
                 "cull_support_at": [0.5, 0.75],
                 "reset_opacity": False,
             },
-        }
+        },
+        "calibration": {"shift": "auto", "silhouette": "auto"},
+        "filter": {"refine": True},
     },
 }

@@ -1,1 +1,66 @@
-"""Edge maps: what is done to a detector's output before it supervises anything."""
+"""What finds the 2D edges. DETECTORS[name](frames, run) -> frames it used, edge maps (V, H, W) uint8, Edgels or None."""
+
+from taichi_edges.errors import UserError
+
+
+def choose_detector(source, frames):
+    """The detector that `source.detector: auto` means: ready maps where the scene names them, else our own."""
+    if source.detector != "auto":
+        return source.detector
+    return "maps" if source.edges or not any(frames.image_paths) else "subpixel"
+
+
+def read_maps(frames, run):
+    """Ready edge maps. They may be biased, and have no edgels yet."""
+    from taichi_edges.readers.images import read_edge_maps
+
+    return frames, read_edge_maps(frames, run.progress, run.threads), None
+
+
+def detect_subpixel(frames, run):
+    """Edgels by our own detector, and maps drawn through them."""
+    from taichi_edges.detectors.drawing import draw_edge_maps
+    from taichi_edges.detectors.subpixel import trace_pictures
+    from taichi_edges.readers.images import check_sizes, frames_with_images
+
+    frames = frames_with_images(frames, run.progress)
+    with run.progress.track("detect", len(frames.names)) as report:
+        edgels, sizes = trace_pictures(frames.image_paths, run.threads, report)
+    check_sizes(frames, sizes, "colour image")
+    if len(edgels) == 0:
+        raise UserError(f"{frames.where}: no edge found in any of {len(frames.names)} images; check source.images")
+    width, height = sizes[0]
+    return frames, draw_edge_maps(edgels, height, width, run.threads), edgels
+
+
+def detect_onnx(frames, run):
+    """Edge maps by a learned detector, biased as such detectors are."""
+    import numpy as np
+
+    from taichi_edges.detectors.onnx import detect_maps
+    from taichi_edges.readers.images import check_sizes, frames_with_images
+
+    frames, onnx = frames_with_images(frames, run.progress), run.config.source.onnx
+    model = run.data_path(onnx.model, "source.onnx.model")
+    images = CompositedImages(frames.image_paths)
+    maps = detect_maps(images, model, onnx.network, onnx.scale, onnx.flip, run.threads, run.progress)
+    check_sizes(frames, [(edge_map.shape[1], edge_map.shape[0]) for edge_map in maps], "colour image")
+    return frames, np.stack(maps), None
+
+
+class CompositedImages:
+    """The images of some paths, each decoded when it is asked for: (H, W, 3) uint8 RGB, composited over white."""
+
+    def __init__(self, paths):
+        self.paths = paths
+
+    def __len__(self):
+        return len(self.paths)
+
+    def __getitem__(self, index):
+        from taichi_edges.detectors.pictures import read_composited
+
+        return read_composited(self.paths[index])
+
+
+DETECTORS = {"maps": read_maps, "subpixel": detect_subpixel, "onnx": detect_onnx}

@@ -85,7 +85,16 @@ class EdgelMatching:
         gates = float(radius), MOST_SINE
         if len(points):
             find_matches(
-                *blocks_of(points), views.start, points, directions, self.cameras, *self.size, *grid, *gates, found, residuals
+                *blocks_of(points),
+                views.start,
+                points,
+                directions,
+                self.cameras,
+                *self.size,
+                *grid,
+                *gates,
+                found,
+                residuals,
             )
         found = download(found)
         order = np.append(self.grid.order.astype(np.int32), np.int32(-1))
@@ -107,9 +116,7 @@ def project_line(camera, point, direction):
 
 
 @ti.func
-def nearest_edgel(
-    view, pixel, along, radius, most_sine, rows, columns, starts: ti.template(), elements: ti.template()
-):
+def nearest_edgel(view, pixel, along, radius, most_sine, rows, columns, starts: ti.template(), elements: ti.template()):
     """Index in `elements` of the edgel nearest to a pixel that runs along the unit vector `along`; -1 where none is."""
     nearest, best = -1, radius * radius
     first_column = ti.max(ti.cast(ti.floor((pixel[0] - radius) / CELL), ti.i32), 0)

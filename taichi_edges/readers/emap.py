@@ -15,14 +15,13 @@ def read_emap(folder, config):
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{where}: has no 'frames'; is this EMAP's meta_data.json?")
-    if not config.edges:
-        raise UserError(f"{where}: source.edges is missing: the folder of the edge maps, e.g. edge_DexiNed")
+    images = config.images or ("color" if (folder / "color").is_dir() else "")
     names = [_name(frame, where) for frame in frames]
     return Frames(
         where=where,
         names=[name.rsplit(".", 1)[0] for name in names],
-        edge_paths=[folder / config.edges / name for name in names],
-        image_paths=[folder / config.images / name if config.images else "" for name in names],
+        edge_paths=[folder / config.edges / name if config.edges else "" for name in names],
+        image_paths=[folder / images / name if images else "" for name in names],
         intrinsics=[partial(_intrinsics, frame, name, where) for frame, name in zip(frames, names, strict=True)],
         camera_to_world=[frame.get("camtoworld") for frame in frames],
         opengl=False,

@@ -1,7 +1,6 @@
 """Frames: what a reader found on disk, before anything is decoded; and how frames become Views, with every check."""
 
 import json
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from taichi_edges.views import Views
 ORTHONORMAL_TOLERANCE = 1e-3  # largest deviation of R^T R from the identity; files store six digits or more
 BOX_GRID = 9  # points along each side of the scene box that are looked for in every view
 OFF_CENTRE = 0.25  # of the image's size: a principal point farther from the centre is worth a warning
-MOSTLY_EDGES = 0.5  # share of edge pixels from which on the maps must be black on white
 LEAVE_OUT = "or leave such views out with source.skip"
 TAIL_BYTES = 64  # some writers pad the file behind its end marker
 # What a whole file ends with; a decoder alone may fill the missing rows of a truncated file with grey.
@@ -70,18 +68,17 @@ def matrix(values, shape, where, key):
     return array
 
 
-def build_views(frames, config, box, progress, threads=None):
-    """Check the frames, decode the edge maps and bring the scene box into the unit cube.
+def build_views(frames, config, box, progress, detect):
+    """Check the frames, get their edges and bring the scene box into the unit cube.
 
-    config: the scene's `source` section. box: (2, 3) corners, input units. threads: None for as many as pay.
+    config: the scene's `source` section. box: (2, 3) corners, input units. detect: function of the frames that gives
+    edge maps (V, H, W) uint8 and Edgels, or None in place of these.
     """
-    frames = _without_skipped(frames, config.skip)
-    _check_names(frames)
     poses = np.stack([matrix(pose, (4, 4), frames.where, f"the pose of {name}") for name, pose in _each(frames)])
     _check_poses(frames, poses)
     opengl = frames.opengl if config.axes == "auto" else config.axes == "opengl"
     poses = poses @ OPENGL_TO_OPENCV if opengl else poses
-    edge_maps = _read_edge_maps(frames, progress, threads)
+    edge_maps, edgels = detect(frames)
     height, width = edge_maps.shape[1:]
     intrinsics = np.stack([intrinsics_for(width, height) for intrinsics_for in frames.intrinsics])
     _check_intrinsics(frames, intrinsics, width, height, progress)
@@ -97,6 +94,7 @@ def build_views(frames, config, box, progress, threads=None):
         similarity=similarity,
         box=similarity.to_unit(np.asarray(box, dtype=np.float64)),
         input_to_truth=frames.input_to_truth,
+        edgels=edgels,
     )
 
 
@@ -112,13 +110,21 @@ def _each(frames):
     return zip(frames.names, frames.camera_to_world, strict=True)
 
 
-def _without_skipped(frames, skip):
+def chosen_frames(frames, skip):
+    """The frames without the views to skip; their names must be unique."""
     for name in skip:
         if name not in frames.names:
             raise UserError(f"source.skip: {frames.where} has no view '{name}'{did_you_mean(name, frames.names)}")
     keep = [i for i, name in enumerate(frames.names) if name not in skip]
     if not keep:
         raise UserError(f"{frames.where}: source.skip leaves out all of its {len(frames.names)} views; shorten it")
+    frames = subset(frames, keep)
+    _check_names(frames)
+    return frames
+
+
+def subset(frames, keep):
+    """Some of the frames, by their indices."""
     lists = ("names", "edge_paths", "image_paths", "intrinsics", "camera_to_world")
     chosen = {key: [getattr(frames, key)[i] for i in keep] for key in lists}
     return Frames(
@@ -136,22 +142,22 @@ def _check_names(frames):
 def _check_poses(frames, poses):
     """Finite, orthonormal, right-handed, and the last row 0 0 0 1."""
     finite = np.isfinite(poses).all(axis=(1, 2))
-    _refuse(frames, ~finite, f"the pose is not finite; export the poses again, {LEAVE_OUT}")
+    refuse_views(frames, ~finite, f"the pose is not finite; export the poses again, {LEAVE_OUT}")
     rotations = poses[:, :3, :3]
     gram = np.swapaxes(rotations, 1, 2) @ rotations
     crooked = np.abs(gram - np.eye(3)).max(axis=(1, 2)) > ORTHONORMAL_TOLERANCE
     squares = np.trace(gram, axis1=1, axis2=2)[:, None, None] / 3  # of the scale, where there is nothing but a scale
     scaled = (np.abs(gram - squares * np.eye(3)) < ORTHONORMAL_TOLERANCE * squares).all(axis=(1, 2))
     cure = "divide the scale out of it" if scaled[crooked].all() else "export the poses again"
-    _refuse(frames, crooked, f"the rotation of the pose is not orthonormal; {cure}, {LEAVE_OUT}")
+    refuse_views(frames, crooked, f"the rotation of the pose is not orthonormal; {cure}, {LEAVE_OUT}")
     problem = "the rotation of the pose is a mirror (determinant -1); export the poses with right-handed axes"
-    _refuse(frames, np.linalg.det(rotations) < 0, f"{problem}, {LEAVE_OUT}")
+    refuse_views(frames, np.linalg.det(rotations) < 0, f"{problem}, {LEAVE_OUT}")
     last = np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1) > ORTHONORMAL_TOLERANCE
     problem = "the last row of the pose is not 0 0 0 1 (is it transposed?)"
-    _refuse(frames, last, f"{problem}; export the poses again, {LEAVE_OUT}")
+    refuse_views(frames, last, f"{problem}; export the poses again, {LEAVE_OUT}")
 
 
-def _refuse(frames, bad, problem):
+def refuse_views(frames, bad, problem):
     """UserError that names the views marked in the (V,) bool array `bad`."""
     if bad.any():
         names = [name for name, is_bad in zip(frames.names, bad, strict=True) if is_bad]
@@ -161,14 +167,16 @@ def _refuse(frames, bad, problem):
 def _check_intrinsics(frames, intrinsics, width, height, progress):
     focal = intrinsics[:, [0, 1], [0, 1]]
     bad = ~np.isfinite(intrinsics).all(axis=(1, 2)) | (focal <= 0).any(axis=1)
-    _refuse(frames, bad, f"the focal length is not a positive number; correct the intrinsics, {LEAVE_OUT}")
+    refuse_views(frames, bad, f"the focal length is not a positive number; correct the intrinsics, {LEAVE_OUT}")
     lower = np.abs(intrinsics[:, [1, 2, 2, 2], [0, 0, 1, 2]] - [0, 0, 0, 1]).max(axis=1) > 1e-9
-    _refuse(frames, lower, f"the intrinsics must read fx 0 cx, 0 fy cy, 0 0 1 row by row; correct them, {LEAVE_OUT}")
+    refuse_views(
+        frames, lower, f"the intrinsics must read fx 0 cx, 0 fy cy, 0 0 1 row by row; correct them, {LEAVE_OUT}"
+    )
     skewed = np.abs(intrinsics[:, 0, 1]) > 1e-6 * focal[:, 0]
-    _refuse(frames, skewed, "the intrinsics have skew, which is not supported; rectify the images")
+    refuse_views(frames, skewed, "the intrinsics have skew, which is not supported; rectify the images")
     outside = (intrinsics[:, :2, 2] < 0).any(axis=1) | (intrinsics[:, :2, 2] > [width, height]).any(axis=1)
     problem = f"the principal point is outside the {width} x {height} px image (resized after calibration?)"
-    _refuse(frames, outside, f"{problem}; correct the intrinsics, {LEAVE_OUT}")
+    refuse_views(frames, outside, f"{problem}; correct the intrinsics, {LEAVE_OUT}")
     off_centre = np.abs((intrinsics[:, :2, 2] + 0.5) / [width, height] - 0.5).max(axis=1) > OFF_CENTRE
     if off_centre.any():
         names = name_some([name for name, is_off in zip(frames.names, off_centre, strict=True) if is_off])
@@ -176,48 +184,8 @@ def _check_intrinsics(frames, intrinsics, width, height, progress):
         progress.warn(f"{off_centre.sum()} of {len(off_centre)} views: {what} (resized after calibration?): {names}")
 
 
-def _read_edge_maps(frames, progress, threads):
-    """(V, H, W) uint8, decoded in parallel; missing, damaged and wrongly sized maps are named."""
-    paths = [Path(path) for path in frames.edge_paths]
-    missing = np.array([not path.is_file() for path in paths])
-    if missing.all():
-        folders = f"{frames.where.parent} has: {_folders(frames)}"
-        raise UserError(f"{paths[0].parent}: no edge map found here; check source.edges ({folders})")
-    problem = f"the edge map is missing ({paths[int(missing.argmax())]})"
-    _refuse(frames, missing, f"{problem}; run the detector on it, {LEAVE_OUT}")
-    with ThreadPoolExecutor(threads) as pool:
-        maps = list(pool.map(read_grey, paths))
-    broken = np.array([edge_map is None for edge_map in maps])
-    problem = f"the edge map is truncated or not an 8- or 16-bit image ({paths[int(broken.argmax())]})"
-    _refuse(frames, broken, f"{problem}; write it again, {LEAVE_OUT}")
-    sizes = [(edge_map.shape[1], edge_map.shape[0]) for edge_map in maps]
-    size = frames.size or max(set(sizes), key=sizes.count)
-    wrong = np.array([s != size for s in sizes])
-    if wrong.any():
-        width, height = sizes[int(wrong.argmax())]
-        expected = f"{frames.where.name} says" if frames.size else "the others are"
-        problem = f"the edge map is {width} x {height} px, but {expected} {size[0]} x {size[1]} px"
-        _refuse(frames, wrong, f"{problem}; write it in that size, {LEAVE_OUT}")
-    maps = np.stack(maps)
-    shares = np.array([np.count_nonzero(edge_map >= 128) for edge_map in maps]) / maps[0].size
-    empty = shares == 0
-    if empty.all():
-        problem = "no edge map has an edge pixel, a value of 128 or more; scale the maps to 0..255"
-        raise UserError(f"{paths[0].parent}: {problem}, or check source.edges")
-    if shares.mean() > MOSTLY_EDGES:
-        problem = (
-            f"{100 * shares.mean():.0f} % of all pixels are edge pixels; edges must be white on black: invert the maps"
-        )
-        raise UserError(f"{paths[0].parent}: {problem}, or check source.edges")
-    problem = "most of the edge map is edge pixels, white; edges are thin lines: write it again"
-    _refuse(frames, shares > MOSTLY_EDGES, f"{problem}, {LEAVE_OUT}")
-    if empty.any():
-        names = [name for name, is_empty in zip(frames.names, empty, strict=True) if is_empty]
-        progress.warn(f"{len(names)} of {len(maps)} edge maps have no edge pixel and teach nothing: {name_some(names)}")
-    return maps
-
-
-def _folders(frames):
+def folders_beside(frames):
+    """The folders next to the file that lists the frames, in words."""
     folders = sorted(p.name for p in frames.where.parent.iterdir() if p.is_dir())
     return name_some(folders, 8) or "no folders"
 
@@ -230,29 +198,15 @@ def is_whole(path):
         return size > 0 and (marker is None or marker in file.read())
 
 
-def read_grey(path):
-    """(H, W) uint8 of an image file: one channel, or the brightest of three; None where it is damaged.
-
-    16-bit maps are brought to 8 bits.
-    """
-    import cv2
-
-    if not is_whole(path):
-        return None
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        return None
-    if image.dtype == np.uint16:
-        image = (image // 257).astype(np.uint8)
-    if image.dtype != np.uint8:
-        return None
-    return image if image.ndim == 2 else np.ascontiguousarray(image[:, :, :3].max(axis=2))
+def is_usable(path):
+    """Whether there is an image file at `path`, '' for none, and whole."""
+    return bool(path) and Path(path).is_file() and is_whole(Path(path))
 
 
 def _usable_images(frames, progress):
     """Paths of the colour images that are there and whole, '' for the others (named in a warning)."""
     wanted = [Path(path) if path else None for path in frames.image_paths]
-    usable = [path is not None and path.is_file() and is_whole(path) for path in wanted]
+    usable = [is_usable(path) for path in frames.image_paths]
     lost = [name for name, path, ok in zip(frames.names, wanted, usable, strict=True) if path is not None and not ok]
     if lost:
         problem = "is missing or truncated; their overlays show the edge map instead"
@@ -278,7 +232,7 @@ def _check_box_seen(frames, intrinsics, poses, box, size, opengl):
         else:
             cure = f"correct the box (the cameras are around {centre}) or source.axes, now {used}"
         raise UserError(f"{frames.where}: 0 of {len(seeing)} views see the scene box {corners}: {cure}")
-    _refuse(frames, ~seeing, f"the scene box {corners} is not in sight; correct the box or the pose, {LEAVE_OUT}")
+    refuse_views(frames, ~seeing, f"the scene box {corners} is not in sight; correct the box or the pose, {LEAVE_OUT}")
 
 
 def _views_that_see(box, intrinsics, world_to_camera, size):

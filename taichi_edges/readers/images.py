@@ -1,0 +1,101 @@
+"""What the frames' image files hold: ready edge maps, decoded and checked; and which frames have a colour image."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from taichi_edges.errors import UserError, name_some
+from taichi_edges.readers.frames import LEAVE_OUT, folders_beside, is_usable, is_whole, refuse_views, subset
+
+MOSTLY_EDGES = 0.5  # share of edge pixels from which on the maps must be black on white
+
+
+def frames_with_images(frames, progress):
+    """The frames whose colour image is there and whole; the others are named in a warning."""
+    if not any(frames.image_paths):
+        folders = f"{frames.where.parent} has: {folders_beside(frames)}"
+        raise UserError(f"{frames.where}: no colour images to detect edges in; set source.images ({folders})")
+    usable = [is_usable(path) for path in frames.image_paths]
+    if not any(usable):
+        path = Path(frames.image_paths[0])
+        raise UserError(f"{path.parent}: no colour image found here; check source.images")
+    lost = [name for name, ok in zip(frames.names, usable, strict=True) if not ok]
+    if lost:
+        progress.warn(
+            f"{len(lost)} of {len(usable)} views left out, their colour image is missing or truncated: "
+            f"{name_some(lost)}"
+        )
+    return subset(frames, [i for i, ok in enumerate(usable) if ok])
+
+
+def check_sizes(frames, sizes, what):
+    """UserError where the (width, height) of some image, `what` it is, is not that of the others or of the file."""
+    size = frames.size or max(set(sizes), key=sizes.count)
+    wrong = np.array([s != size for s in sizes])
+    if wrong.any():
+        width, height = sizes[int(wrong.argmax())]
+        expected = f"{frames.where.name} says" if frames.size else "the others are"
+        problem = f"the {what} is {width} x {height} px, but {expected} {size[0]} x {size[1]} px"
+        refuse_views(frames, wrong, f"{problem}; write it in that size, {LEAVE_OUT}")
+
+
+def read_edge_maps(frames, progress, threads=None):
+    """(V, H, W) uint8, decoded in parallel; missing, damaged and wrongly sized maps are named."""
+    if not any(frames.edge_paths):
+        folders = f"{frames.where.parent} has: {folders_beside(frames)}"
+        raise UserError(f"{frames.where}: no edge maps: set source.edges to their folder, or source.images ({folders})")
+    paths = [Path(path) for path in frames.edge_paths]
+    missing = np.array([not path.is_file() for path in paths])
+    if missing.all():
+        folders = f"{frames.where.parent} has: {folders_beside(frames)}"
+        raise UserError(f"{paths[0].parent}: no edge map found here; check source.edges ({folders})")
+    problem = f"the edge map is missing ({paths[int(missing.argmax())]})"
+    refuse_views(frames, missing, f"{problem}; run the detector on it, {LEAVE_OUT}")
+    with ThreadPoolExecutor(threads) as pool:
+        maps = list(pool.map(read_grey, paths))
+    broken = np.array([edge_map is None for edge_map in maps])
+    problem = f"the edge map is truncated or not an 8- or 16-bit image ({paths[int(broken.argmax())]})"
+    refuse_views(frames, broken, f"{problem}; write it again, {LEAVE_OUT}")
+    check_sizes(frames, [(edge_map.shape[1], edge_map.shape[0]) for edge_map in maps], "edge map")
+    maps = np.stack(maps)
+    _check_edge_shares(frames, maps, progress, paths[0].parent)
+    return maps
+
+
+def _check_edge_shares(frames, maps, progress, where):
+    """Refuse maps (V, H, W) that cannot be edge maps; name those that are empty. where: their folder."""
+    shares = np.array([np.count_nonzero(edge_map >= 128) for edge_map in maps]) / maps[0].size
+    empty = shares == 0
+    if empty.all():
+        problem = "no edge map has an edge pixel, a value of 128 or more; scale the maps to 0..255"
+        raise UserError(f"{where}: {problem}, or check source.edges")
+    if shares.mean() > MOSTLY_EDGES:
+        problem = (
+            f"{100 * shares.mean():.0f} % of all pixels are edge pixels; edges must be white on black: invert the maps"
+        )
+        raise UserError(f"{where}: {problem}, or check source.edges")
+    problem = "most of the edge map is edge pixels, white; edges are thin lines: write it again"
+    refuse_views(frames, shares > MOSTLY_EDGES, f"{problem}, {LEAVE_OUT}")
+    if empty.any():
+        names = [name for name, is_empty in zip(frames.names, empty, strict=True) if is_empty]
+        progress.warn(f"{len(names)} of {len(maps)} edge maps have no edge pixel and teach nothing: {name_some(names)}")
+
+
+def read_grey(path):
+    """(H, W) uint8 of an image file: one channel, or the brightest of three; None where it is damaged.
+
+    16-bit maps are brought to 8 bits.
+    """
+    import cv2
+
+    if not is_whole(path):
+        return None
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        return None
+    if image.dtype == np.uint16:
+        image = (image // 257).astype(np.uint8)
+    if image.dtype != np.uint8:
+        return None
+    return image if image.ndim == 2 else np.ascontiguousarray(image[:, :, :3].max(axis=2))
