@@ -27,6 +27,7 @@ RANGE_TOLERANCE = 1e-3  # of full scale, by which rounding may take a map out of
 HUGE = 1e30  # no value of a network; OpenCV's convolutions turn NaN into the largest float32
 LONGEST_REASON = 160  # letters of another library's message that are quoted
 FLOAT32 = 1  # TensorProto.DataType
+SILENT = 0  # OpenCV's log level
 MAX_SIDE = 1 << 20  # px; some exporters write 0 or -1, which is 2^64 - 1, for a side that is free
 # Which axes of (1, 3, h, w) are mirrored, each time the network runs. Both ways costs four runs: a shift that is not
 # horizontal needs it.
@@ -276,9 +277,10 @@ def _condensed(error):
 @contextlib.contextmanager
 def _quiet_opencv():
     """OpenCV logs what it also raises; a user is to read it once."""
-    log = cv2.utils.logging
-    before = log.setLogLevel(log.LOG_LEVEL_SILENT)
+    log = cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging  # OpenCV 4 has it here, OpenCV 5 there
+    before = log.getLogLevel()
     try:
+        log.setLogLevel(SILENT)
         yield
     finally:
         log.setLogLevel(before)

@@ -20,10 +20,13 @@ LINE = 22  # px from one line of text to the next
 LETTERS = 0.5  # OpenCV's scale: capitals 11 px high, legible at 100 %
 MAGNIFICATION = 5  # screen pixels per pixel of the view: tenths of a pixel can be told apart
 OVERSAMPLING = 4  # dots are stamped so many times larger and averaged
-DIMMED = 0.35  # brightness left to the picture under dots
+DIMMED = 0.42  # brightness left to the picture under dots
 DOT = 2.4  # px; radius of an edgel in the magnified cell
 SMALL_DOT = 0.8  # px; radius of an edgel in the whole view
+THIN_DOT = 0.6  # px; half the width of a dash
 DASH = 0.5  # px of the view to both sides of an edgel, along its edge
+LEAST_CONTRAST = 32  # of 255; less is noise, and is left as it is
+MIXED = 4  # how many edgels one of the rarer kind outweighs when the part to magnify is chosen
 SCALE_BAR = 10  # px of the view
 EDGE_GAIN = 1.6  # an edge map made smaller pales; the lines are drawn so many times darker then
 PAPER, INK, FAINT = (255, 255, 255), (40, 40, 40), (225, 225, 225)
@@ -35,18 +38,19 @@ WEAKEST = 60  # of viridis' 256 colours; those below vanish on a dark picture
 LIMITS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)  # px; ends of the residuals' colour bar
 COVERED = 95  # percent of the residuals that the colour bar holds
 BINS = 41  # odd, so that one bin is around 0
-MAD_IS_MEDIAN_OF = "median |r - median|"
 
 
 @dataclass(frozen=True)
 class Content:
     """What one row draws.
 
-    picture, edge_map: (H, W, 3) and (H, W) uint8. points, normals: (m, 2) px. strengths: (m,) 0..1. residuals: (m,)
-    px or None. silhouette: (m,) bool or None. window: left, top, width, height of the magnified part, px. limit: px.
+    picture, edge_map: (H, W, 3) and (H, W) uint8. is_photo: is the picture one, not the edge map? points, normals:
+    (m, 2) px. strengths: (m,) 0..1. residuals: (m,) px or None. silhouette: (m,) bool or None. window: left, top,
+    width, height of the magnified part, px. limit: px.
     """
 
     picture: np.ndarray
+    is_photo: bool
     edge_map: np.ndarray
     points: np.ndarray
     normals: np.ndarray
@@ -70,8 +74,9 @@ def write_detection_sheet(path, views, residuals=None, on_silhouette=None, pictu
     silhouette = None if on_silhouette is None else np.asarray(on_silhouette) >= 0.5
     residuals = None if residuals is None else np.asarray(residuals, dtype=np.float64)
     limit, cell = _limit(residuals), _cell_size(views)
-    rows = [_header(views, residuals, silhouette, limit, cell)]
-    for view in choose_views(views, count):
+    chosen = choose_views(views, count)
+    rows = [_header(views, len(chosen), residuals, silhouette, limit, cell)]
+    for view in chosen:
         content = _content(views, view, residuals, silhouette, limit, cell, picture_reader or _read_picture)
         rows += [_row_title(views, view, content, cell), _row([draw(content, cell) for draw in _columns(residuals)])]
     written, encoded = cv2.imencode(".png", np.concatenate(rows)[:, :, ::-1])
@@ -91,8 +96,8 @@ def residual_colours(residuals, limit):
 
 def strength_colours(strengths):
     """(n,) 0..1 -> (n, 3) uint8 RGB of viridis, without its darkest."""
-    levels = np.rint(WEAKEST + (255 - WEAKEST) * np.clip(strengths, 0.0, 1.0)).astype(np.uint8)
-    return cv2.applyColorMap(levels.reshape(-1, 1), cv2.COLORMAP_VIRIDIS).reshape(-1, 3)[:, ::-1]
+    viridis = cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_VIRIDIS).reshape(256, 3)[:, ::-1]
+    return viridis[np.rint(WEAKEST + (255 - WEAKEST) * np.clip(strengths, 0.0, 1.0)).astype(int)]
 
 
 def median_and_mad(residuals):
@@ -129,18 +134,21 @@ def _content(views, view, residuals, silhouette, limit, cell, picture_reader):
     points, normals, strengths = views.edgels.of_view(view)
     of_view = [None if values is None else values[part] for values in (residuals, silhouette)]
     window = _busiest(points, *of_view, (views.width, views.height), cell)
-    picture = _picture(views, view, picture_reader)
-    return Content(picture, views.edge_maps[view], points, normals, strengths, *of_view, window, limit)
+    photo = _photo(views, view, picture_reader)
+    picture = cv2.cvtColor(255 - views.edge_maps[view], cv2.COLOR_GRAY2RGB) if photo is None else photo
+    shown = picture, photo is not None, views.edge_maps[view]
+    return Content(*shown, points, normals, strengths, *of_view, window, limit)
 
 
-def _picture(views, view, picture_reader):
-    """(H, W, 3) uint8 in the size of the view; the edge map, dark on white, where there is no picture of it."""
+def _photo(views, view, picture_reader):
+    """(H, W, 3) uint8 in the size of the view; None where there is no picture of it."""
     picture = picture_reader(views.image_paths[view]) if views.image_paths[view] else None
-    if picture is not None:
-        height, width = picture.shape[:2]
-        if abs(width * views.height / (height * views.width) - 1.0) < SAME_SHAPE:
-            return cv2.resize(picture, (views.width, views.height), interpolation=cv2.INTER_AREA)
-    return cv2.cvtColor(255 - views.edge_maps[view], cv2.COLOR_GRAY2RGB)
+    if picture is None:
+        return None
+    height, width = picture.shape[:2]
+    if abs(width * views.height / (height * views.width) - 1.0) >= SAME_SHAPE:
+        return None
+    return cv2.resize(picture, (views.width, views.height), interpolation=cv2.INTER_AREA)
 
 
 def _busiest(points, residuals, silhouette, size, cell):
@@ -156,7 +164,7 @@ def _busiest(points, residuals, silhouette, size, cell):
         return (size[0] - width) // 2, (size[1] - height) // 2, width, height
     kinds = [counted] if silhouette is None else [counted & silhouette, counted & ~silhouette]
     sums = [_window_sums(points[kind], size, (width, height)) for kind in kinds]
-    score = sum(sums) + len(sums) * np.minimum.reduce(sums)
+    score = sum(sums) + MIXED * np.minimum.reduce(sums)
     top, left = np.unravel_index(np.argmax(score), score.shape)
     return int(left), int(top), width, height
 
@@ -215,16 +223,17 @@ def _magnified_residuals(content, cell):
 def _magnified(content, cell, colours):
     """The window of the view, every pixel a square, with its edgels: a dot at its place, a dash along its edge."""
     left, top, wide, high = content.window
-    part = _dim(content.picture[top : top + high, left : left + wide])
+    part = _dim(_stretched(content.picture[top : top + high, left : left + wide]))
     scale = min(cell[0] / wide, cell[1] / high)
     size = (round(wide * scale), round(high * scale))
     picture = cv2.resize(part, size, interpolation=cv2.INTER_NEAREST)
     inside = ((content.points > (left - 1, top - 1)) & (content.points < (left + wide, top + high))).all(axis=1)
     points, colours = content.points[inside], colours[inside]
     along = content.normals[inside] @ np.array([[0.0, -1.0], [1.0, 0.0]])
-    for step in np.linspace(-DASH, DASH, 2 * MAGNIFICATION):
-        _stamp(picture, (points + step * along - (left, top) + 0.5) * scale - 0.5, colours, 0.6)
-    _stamp(picture, (points - (left, top) + 0.5) * scale - 0.5, colours, DOT)
+    steps = np.linspace(-DASH, DASH, 2 * MAGNIFICATION)[:, None, None]
+    dashes = (points + steps * along).reshape(-1, 2)
+    for places, radius in ((dashes, THIN_DOT), (points, DOT)):
+        _stamp(picture, (places - (left, top) + 0.5) * scale - 0.5, np.resize(colours, places.shape[:1] + (3,)), radius)
     _scale_bar(picture, scale)
     return _centred(picture, cell)
 
@@ -233,10 +242,10 @@ def _scale_bar(picture, scale):
     """A white bar SCALE_BAR pixels of the view long, with its length, at the lower left."""
     length, bottom = round(SCALE_BAR * scale), picture.shape[0] - 10
     words = f"{SCALE_BAR} px"
-    (wide, high), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, LETTERS, 1)
-    if length + wide + 30 > picture.shape[1] or high + 20 > picture.shape[0]:
+    right = 10 + length + 7 + _text_width(words)
+    if right + 5 > picture.shape[1]:
         return
-    cv2.rectangle(picture, (4, bottom - high - 4), (length + wide + 22, bottom + 6), (0, 0, 0), cv2.FILLED)
+    cv2.rectangle(picture, (4, bottom - 15), (right + 5, bottom + 6), (0, 0, 0), cv2.FILLED)
     cv2.rectangle(picture, (10, bottom - 4), (10 + length, bottom - 1), PAPER, cv2.FILLED)
     _write(picture, words, (length + 17, bottom), PAPER)
 
@@ -260,7 +269,7 @@ def _histogram(picture, name, residuals, limit):
     """Bars, the zero line, the median and its number, in place. What lies beyond the limit is in the last bars."""
     height, width = picture.shape[:2]
     median, mad, known = median_and_mad(residuals)
-    _write(picture, f"{name}: {_described(median, mad, known)}", (2, LINE - 6))
+    _write(picture, f"{name}: {_described(median, mad, known)}", (2, LINE - 6), room=width - 4)
     base, tallest = height - 6, height - LINE - 16
     inside = np.clip(residuals[np.isfinite(residuals)], -limit, limit)
     counts, ends = np.histogram(inside, BINS, (-limit, limit))
@@ -279,7 +288,7 @@ def _histogram(picture, name, residuals, limit):
 
 
 def _described(median, mad, known):
-    return f"median {median:+.2f}, MAD {mad:.2f} px ({known})" if known else "none"
+    return f"median {median:+.2f}, MAD {mad:.2f} px, n = {known}" if known else "none"
 
 
 def _across(residual, limit, width):
@@ -304,17 +313,17 @@ HEADINGS = {
     _whole_edgels: ("edgels", "framed: the part that is magnified"),
     _magnified_edgels: ("edgels, magnified", None),
     _magnified_residuals: ("residuals, magnified", None),
-    _histograms: ("residuals", "black: 0, red: median"),
+    _histograms: ("residuals", "red: median; last bars: and beyond"),
 }
 
 
-def _header(views, residuals, silhouette, limit, cell):
+def _header(views, shown, residuals, silhouette, limit, cell):
     """Title, the numbers over all views, and the headings and colour bars of the columns."""
     columns = _columns(residuals)
     width = GAP + len(columns) * (cell[0] + GAP)
     picture = np.full((5 * LINE + GAP, width, 3), 255, np.uint8)
     known = int(np.isfinite(residuals).sum()) if residuals is not None else 0
-    title = f"{len(views)} views of {views.width} x {views.height} px, {len(views.edgels)} edgels"
+    title = f"{len(views)} views of {views.width} x {views.height} px ({shown} shown), {len(views.edgels)} edgels"
     _write(picture, f"{title}, {known} with a residual" if residuals is not None else title, (GAP, LINE), bold=True)
     if residuals is not None:
         _write(picture, f"all views, residuals: {_summary(residuals, silhouette)}", (GAP, 2 * LINE))
@@ -327,7 +336,7 @@ def _header(views, residuals, silhouette, limit, cell):
             ticks = (-limit, 0.0, limit)
             _bar(picture, (left, 4 * LINE + 4), lambda r: residual_colours(r, limit), ticks, "{:+g}", "px", cell)
         else:
-            _write(picture, words, (left, 5 * LINE - 2))
+            _write(picture, words, (left, 5 * LINE - 2), room=cell[0])
     return picture
 
 
@@ -342,9 +351,8 @@ def _bar(picture, corner, colours, ticks, form, unit, cell):
     """A colour bar from the first tick to the last with the numbers and the unit."""
     left, top = corner
     first, last = (form.format(tick) if tick else "0" for tick in (ticks[0], ticks[-1]))
-    wide = cv2.getTextSize(first, cv2.FONT_HERSHEY_SIMPLEX, LETTERS, 1)[0][0]
     _write(picture, first, (left, top + LINE - 6))
-    start, length = left + wide + 6, cell[0] // 2
+    start, length = left + _text_width(first) + 6, cell[0] // 2
     values = colours(np.linspace(ticks[0], ticks[-1], length))
     picture[top + 4 : top + LINE - 4, start : start + length] = values
     cv2.rectangle(picture, (start - 1, top + 3), (start + length, top + LINE - 4), UNKNOWN)
@@ -361,19 +369,24 @@ def _row_title(views, view, content, cell):
     count = f"{len(content.points)} edgels"
     if len(content.points):
         count += f", median strength {np.median(content.strengths):.2f}"
-    words = {_whole_picture: _shortened(views.names[view], cell[0]), _whole_edgels: count, _magnified_edgels: magnified}
+    what = "" if content.is_photo else " (no picture: edge map)"
+    name = _shortened(views.names[view], cell[0] - _text_width(what, bold=True)) + what
+    words = {_whole_picture: name, _whole_edgels: count, _magnified_edgels: magnified}
     if content.residuals is not None:
         words[_magnified_residuals] = f"{np.isfinite(content.residuals).sum()} with a residual"
     for place, column in enumerate(columns):
-        _write(picture, words.get(column, ""), (GAP + place * (cell[0] + GAP), LINE), bold=column is _whole_picture)
+        left, bold = GAP + place * (cell[0] + GAP), column is _whole_picture
+        _write(picture, words.get(column, ""), (left, LINE), bold=bold, room=cell[0])
     return picture
 
 
 def _shortened(words, width):
     """Words that fit `width` px."""
-    while cv2.getTextSize(_ascii(words), cv2.FONT_HERSHEY_SIMPLEX, LETTERS, 2)[0][0] > width:
-        words = words[:-4] + "..."
-    return words
+    for length in range(len(words), 0, -1):
+        shorter = words if length == len(words) else words[:length] + "..."
+        if _text_width(_ascii(shorter), bold=True) <= width:
+            return shorter
+    return ""
 
 
 def _row(cells):
@@ -389,18 +402,22 @@ def _ascii(words):
     return words.encode("ascii", "replace").decode()
 
 
-def _write(picture, words, origin, colour=INK, bold=False):
-    """Letters with their lower left corner at `origin`, (x, y) px."""
-    place = tuple(round(value) for value in origin)
-    cv2.putText(
-        picture, _ascii(words), place, cv2.FONT_HERSHEY_SIMPLEX, LETTERS, colour, 2 if bold else 1, cv2.LINE_AA
-    )
+def _text_width(words, bold=False):
+    """px; OpenCV 5 writes narrower letters than OpenCV 4."""
+    return cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, LETTERS, 2 if bold else 1)[0][0]
+
+
+def _write(picture, words, origin, colour=INK, bold=False, room=None):
+    """Letters with their lower left corner at `origin`, (x, y) px; smaller ones where they need more than `room` px."""
+    words, place = _ascii(words), tuple(round(value) for value in origin)
+    scale = LETTERS * min(1.0, (room or np.inf) / max(_text_width(words, bold), 1))
+    cv2.putText(picture, words, place, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 2 if bold else 1, cv2.LINE_AA)
 
 
 def _write_centred(picture, words, column, baseline):
     """Letters around a column, pushed inside the picture."""
-    wide = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, LETTERS, 1)[0][0]
-    _write(picture, words, (np.clip(column - wide / 2, 0, picture.shape[1] - wide), baseline))
+    wide = _text_width(words)
+    _write(picture, words, (np.clip(column - wide / 2, 0, picture.shape[1] - wide - 1), baseline))
 
 
 # --- Pixels ---
@@ -419,7 +436,14 @@ def _centred(picture, cell):
     whole = np.full((cell[1], cell[0], 3), FAINT, np.uint8)
     top, left = (cell[1] - picture.shape[0]) // 2, (cell[0] - picture.shape[1]) // 2
     whole[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
+    cv2.rectangle(whole, (0, 0), (cell[0] - 1, cell[1] - 1), FAINT)  # or a white view has no border on white paper
     return whole
+
+
+def _stretched(picture):
+    """A picture with all its contrast, the same factor for the three channels: dark corners are looked into as well."""
+    dark, bright = np.percentile(picture, (1, 99))
+    return np.clip((picture - dark) * (255 / max(bright - dark, LEAST_CONTRAST)), 0, 255)
 
 
 def _dim(picture):
