@@ -86,7 +86,6 @@ def test_views_without_edgels_and_without_known_residuals(tmp_path, generator):
     count = len(views.edgels)
     write_detection_sheet(tmp_path / "some.png", views, generator.normal(size=count), np.zeros(count, bool))
     write_detection_sheet(tmp_path / "unknown.png", views, np.full(count, np.nan), np.ones(count))
-    assert has_colour(read(tmp_path / "unknown.png"), UNKNOWN)
     none = replace(views, edgels=views.edgels.keep(np.zeros(count, bool)))
     path = write_detection_sheet(tmp_path / "none.png", none, np.zeros(0), np.zeros(0, bool))
     assert read(path).shape[:2] == expected_size(3, 6, 300)
@@ -163,6 +162,13 @@ def test_residuals_on_the_sheet_have_both_colours_only_where_there_are_both(tmp_
     inward = read(write_detection_sheet(tmp_path / "in.png", views, -residuals))[cells]
     assert has_colour(outward, POSITIVE) and not has_colour(outward, NEGATIVE)
     assert has_colour(inward, NEGATIVE) and not has_colour(inward, POSITIVE)
+
+
+def test_edgels_without_a_residual_are_grey(generator):
+    views, cell = make_views(generator, 1), (400, 300)
+    content = sheet._content(views, 0, np.full(len(views.edgels), np.nan), None, 1.0, cell, None)
+    drawn = sheet._magnified_residuals(replace(content, picture=np.zeros((120, 160, 3), np.uint8)), cell)
+    assert has_colour(drawn, UNKNOWN) and not has_colour(drawn, POSITIVE) and not has_colour(drawn, NEGATIVE)
 
 
 def test_strong_edgels_differ_from_weak_ones():

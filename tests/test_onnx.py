@@ -382,6 +382,17 @@ def test_an_unknown_operator_is_named_with_the_remedy(tmp_path, no_onnxruntime):
     assert "operator FancyEdges is not supported" in text and "pip install onnxruntime" in text
 
 
+def test_reasons_of_opencv_are_condensed():
+    """As OpenCV 5 and 4 word them."""
+    start = "OpenCV(4.12.0) /io/x.cpp:1: error: "
+    node = "(-2:Unspecified error) in function 'handleNode'\n> Node [Shape@ai.onnx]:(n) parse error: "
+    layer = '(-2:Unspecified error) Can\'t create layer "n" of type "Fancy" in function \'getLayerInstance\''
+    check = "(-215:Assertion failed) inputs.size() > 0 in function 'getMemoryShapes'"
+    assert onnx._condensed(f"{start}{node}{start}{layer}\n>") == "its operator Fancy is not supported"
+    assert onnx._condensed(f"{start}{node}{start}{check}\n>") == "its operator Shape fails"
+    assert onnx._condensed(f"{start}{check}") == "inputs.size() > 0"
+
+
 def test_an_output_that_is_not_there_is_refused(tmp_path):
     text = refusal(identity(tmp_path / "one.onnx"), Preset(PLAIN.mean, output=6))
     assert "there is no output 6; it has 1, from 0 to 0 (map)" in text

@@ -25,7 +25,7 @@ TILE_OVERLAP = 64  # px that two neighbouring tiles share, over which one fades 
 MIN_TILE = 2 * TILE_OVERLAP  # px; a smaller network sees nothing but margins
 RANGE_TOLERANCE = 1e-3  # of full scale, by which rounding may take a map out of its range
 HUGE = 1e30  # no value of a network; OpenCV's convolutions turn NaN into the largest float32
-LONGEST_REASON = 160  # letters of another library's message that are quoted
+LONGEST_REASON = 200  # letters of another library's message that are quoted
 FLOAT32 = 1  # TensorProto.DataType
 SILENT = 0  # OpenCV's log level
 MAX_SIDE = 1 << 20  # px; some exporters write 0 or -1, which is 2^64 - 1, for a side that is free
@@ -266,9 +266,10 @@ class _Network:
 def _condensed(error):
     """The reason in another library's message: the operator where it names one, else its last statement."""
     text = " ".join(str(error).split())
-    operator = re.search(r'of type "(\w+)"', text) or re.search(r"Node \[(\w+)@", text)
-    if operator:
-        return f"its operator {operator[1]} is not supported"
+    if unknown := re.search(r'of type "(\w+)"', text):
+        return f"its operator {unknown[1]} is not supported"
+    if failing := re.search(r"Node \[(\w+)@", text):
+        return f"its operator {failing[1]} fails"
     statement = re.split(r"error: \(-?\d+:[^)]*\) ", text)[-1]
     statement = re.sub(r" in function '[^']*'.*", "", statement)
     return statement[:LONGEST_REASON].rstrip(" >")
