@@ -22,7 +22,7 @@ MAGNIFICATION = 5  # screen pixels per pixel of the view: tenths of a pixel can 
 OVERSAMPLING = 4  # dots are stamped so many times larger and averaged
 DIMMED = 0.42  # brightness left to the picture under dots
 DOT = 2.4  # px; radius of an edgel in the magnified cell
-SMALL_DOT = 0.8  # px; radius of an edgel in the whole view
+SMALL_DOT = 0.8  # px; least radius of an edgel in the whole view
 THIN_DOT = 0.6  # px; half the width of a dash
 DASH = 0.5  # px of the view to both sides of an edgel, along its edge
 LEAST_CONTRAST = 32  # of 255; less is noise, and is left as it is
@@ -35,7 +35,7 @@ UNKNOWN = (150, 150, 150)  # an edgel whose residual is not known
 NEGATIVE, ZERO, POSITIVE = (86, 180, 233), (245, 245, 245), (255, 140, 0)
 FRAME = (255, 90, 90)  # of the part that is magnified
 WEAKEST = 60  # of viridis' 256 colours; those below vanish on a dark picture
-LIMITS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)  # px; ends of the residuals' colour bar
+LIMITS = (0.1, 0.2, 0.3, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # px; ends of the residuals' colour bar
 COVERED = 95  # percent of the residuals that the colour bar holds
 BINS = 41  # odd, so that one bin is around 0
 
@@ -206,7 +206,7 @@ def _whole_edgels(content, cell):
     scale = picture.shape[1] / content.picture.shape[1]
     order = np.argsort(content.strengths, kind="stable")  # the sure ones on top
     places = (content.points[order] + 0.5) * scale - 0.5
-    _stamp(picture, places, strength_colours(content.strengths[order]), SMALL_DOT)
+    _stamp(picture, places, strength_colours(content.strengths[order]), np.clip(0.4 * scale, SMALL_DOT, DOT))
     left, top, wide, high = (round(side * scale) for side in content.window)
     cv2.rectangle(picture, (left, top), (left + wide - 1, top + high - 1), FRAME, 2)
     return _centred(picture, cell)
