@@ -51,7 +51,11 @@ class Stage:
 
 STAGES = {
     "prepare": Stage(
-        stages.prepare, ("source", "box", "seed", "train.edge_threshold"), (), ("views.npz",), stages.source_files
+        stages.prepare,
+        ("source", "calibration", "box", "seed", "train.edge_threshold"),
+        (),
+        ("views.npz",),
+        stages.source_files,
     ),
     "train": Stage(
         stages.train,
@@ -63,9 +67,10 @@ STAGES = {
     ),
     "cluster": Stage(
         stages.cluster,
-        ("filter", "cluster", "train.edge_threshold"),
+        ("filter", "cluster", "train.edge_threshold", "seed"),
         ("gaussians.ply", "views.npz"),
         ("points.ply", "clusters.npz"),
+        on_device=True,
     ),
     "fit": Stage(stages.fit, ("fit", "name", "seed"), ("clusters.npz", "views.npz"), ("edges.json",)),
     "evaluate": Stage(

@@ -21,22 +21,108 @@ from taichi_edges.edge_set import read_edges, write_edges
 from taichi_edges.errors import UserError, did_you_mean
 from taichi_edges.views import read_views, write_views
 
+CALIBRATION_SEEDS = 4000  # 3D points through which a detector's biases are measured, at most
+
 
 def prepare(run):
-    """Source -> `views.npz`, and for synthetic scenes the exact edges as `truth.json` and pictures in `images/`."""
-    source = run.config.source
-    if source.reader == "synthetic":
+    """Source -> `views.npz` and `detection.png`; of synthetic scenes also `truth.json` and pictures in `images/`."""
+    if run.config.source.reader == "synthetic":
         return _prepare_synthetic(run)
+    from taichi_edges.detectors import DETECTORS, choose_detector
     from taichi_edges.readers import READERS
-    from taichi_edges.readers.frames import build_views
+    from taichi_edges.readers.frames import build_views, chosen_frames
 
-    folder = run.data_path(source.path, "source.path")
-    frames = READERS[source.reader](folder, source)
-    views = build_views(frames, source, run.config.box, run.progress, run.threads)
-    views, facts = _with_edgels(views, source, run.config.train.edge_threshold, run.threads)
+    source = run.config.source
+    frames = chosen_frames(READERS[source.reader](run.data_path(source.path, "source.path"), source), source.skip)
+    detector = choose_detector(source, frames)
+    frames, edge_maps, edgels = DETECTORS[detector](frames, run)
+    views = build_views(frames, edge_maps, edgels, source, run.config.box, run.progress)
+    return {"detector": detector, **_finish_views(run, views)}
+
+
+def _finish_views(run, views):
+    """Trace and calibrate the edgels where the detector gave maps, write `views.npz` and the report; the facts."""
+    facts = {"views": len(views), "width_px": views.width, "height_px": views.height}
+    residuals = {}
+    if views.edgels is None:
+        views, width = _traced(run, views)
+        facts["line_width_px"] = round(width, 2)
+        views, calibration = _calibrated(run, views)
+        if calibration is not None:
+            facts["calibration"] = calibration.facts()
+            residuals = {"residuals": calibration.residuals, "on_silhouette": calibration.on_silhouette}
+    facts["edgels"] = len(views.edgels)
     write_views(run.path("views.npz"), views)
-    size = {"width_px": views.width, "height_px": views.height}
-    return {"views": len(views), **size, **facts, "files": _copy_points(run)}
+    return {**facts, "files": [_write_sheet(run, views, residuals), *_copy_points(run)]}
+
+
+def _traced_in_pictures(run, views):
+    """The views with edgels of their own pictures, and maps drawn through these."""
+    from taichi_edges.detectors.drawing import draw_edge_maps
+    from taichi_edges.detectors.subpixel import trace_pictures
+
+    with run.progress.track("detect", len(views)) as report:
+        edgels, _ = trace_pictures(with_whole_paths(run, views).image_paths, run.threads, report)
+    return replace(views, edgels=edgels, edge_maps=draw_edge_maps(edgels, views.height, views.width, run.threads))
+
+
+def with_whole_paths(run, views):
+    """The views with paths that can be opened: pictures of a synthetic scene lie in the run's own folder."""
+    return replace(views, image_paths=tuple(str(run.path(path)) if path else "" for path in views.image_paths))
+
+
+def _traced(run, views):
+    """The views with the edgels on the ridges of their maps, and the width of the maps' lines, px."""
+    from taichi_edges.detectors.ridges import trace_ridges
+    from taichi_edges.support import line_width
+
+    width, _ = line_width(views, run.config.train.edge_threshold)
+    return replace(
+        views, edgels=trace_ridges(views.edge_maps, width, run.config.source.thin_threshold, run.threads)
+    ), width
+
+
+def _calibrated(run, views):
+    """The views with unbiased edgels, and their maps drawn through these if the scene wants that; the Calibration."""
+    from taichi_edges.detectors.drawing import draw_edge_maps
+
+    def redrawn(edgels):
+        maps = draw_edge_maps(edgels, views.height, views.width, run.threads)
+        return replace(views, edgels=edgels, edge_maps=maps)
+
+    wanted, calibration = run.config.calibration, None
+    edgels = views.edgels
+    if (wanted.shift, wanted.silhouette) != ("off", "off") and len(edgels):
+        edgels, calibration = _calibrate(run, views, redrawn(edgels))
+    return redrawn(edgels) if run.config.source.thin else replace(views, edgels=edgels), calibration
+
+
+def _calibrate(run, views, thin):
+    """The edgels without the detector's biases, and the Calibration. thin: the views with maps drawn thin."""
+    from taichi_edges.detectors.calibration import calibrate
+    from taichi_edges.kernels.device import start_taichi
+    from taichi_edges.splatting.voting import vote_seeds
+
+    start_taichi("cpu", run.threads, run.config.seed, run.kernel_cache)  # here as everywhere: prepare is no GPU's work
+    generator = np.random.default_rng(run.config.seed)
+    seeds = vote_seeds(thin, run.config.train.edge_threshold, generator, CALIBRATION_SEEDS)
+    fixed = {"off": 0.0, "auto": None}
+    wanted = run.config.calibration
+    shift, silhouette = (
+        fixed[value] if isinstance(value, str) else value for value in (wanted.shift, wanted.silhouette)
+    )
+    shift = (0.0, 0.0) if shift == 0.0 else shift
+    return calibrate(
+        with_whole_paths(run, views), views.edgels, seeds.points, seeds.directions, shift, silhouette, run.threads
+    )
+
+
+def _write_sheet(run, views, residuals):
+    """The picture of what the detector gave; its name."""
+    from taichi_edges.exporters.detection_sheet import write_detection_sheet
+
+    write_detection_sheet(run.path("detection.png"), with_whole_paths(run, views), **residuals)
+    return "detection.png"
 
 
 def _copy_points(run):
@@ -50,18 +136,6 @@ def _copy_points(run):
     points = read_points(run.data_path(run.config.source.points, "source.points"), run.config.box)
     write_float_vertices(run.path("seeds.ply"), ("x", "y", "z"), points)
     return ["seeds.ply"]
-
-
-def _with_edgels(views, source, edge_threshold, threads):
-    """The views with the edgels of their edge maps, redrawn through them if the scene wants that; and the facts."""
-    from taichi_edges.detectors.drawing import draw_edge_maps
-    from taichi_edges.detectors.ridges import trace_ridges
-    from taichi_edges.support import line_width
-
-    width, _ = line_width(views, edge_threshold)
-    edgels = trace_ridges(views.edge_maps, width, source.thin_threshold, threads)
-    edge_maps = draw_edge_maps(edgels, views.height, views.width, threads) if source.thin else views.edge_maps
-    return replace(views, edge_maps=edge_maps, edgels=edgels), {"line_width_px": round(width, 2)}
 
 
 def _prepare_synthetic(run):
@@ -85,18 +159,11 @@ def _prepare_synthetic(run):
     for file, picture in zip(files, pictures, strict=True):
         with replacing(run.path(file)) as unfinished:
             unfinished.write_bytes(cv2.imencode(".png", picture[:, :, ::-1])[1])
-    views, facts = _with_edgels(views, source, run.config.train.edge_threshold, run.threads)
     views = replace(views, image_paths=tuple(files))
-    write_edges(run.path("truth.json"), part.edges, {"part": part.name})
-    write_views(run.path("views.npz"), views)
-    size = {"width_px": views.width, "height_px": views.height}
-    return {
-        "views": len(views),
-        **size,
-        **facts,
-        "part": part.name,
-        "files": ["truth.json", *files, *_copy_points(run)],
-    }
+    if source.detector == "subpixel":
+        views = _traced_in_pictures(run, views)
+    facts = _finish_views(run, views)
+    return {"part": part.name, **facts, "files": ["truth.json", *files, *facts["files"]]}
 
 
 def train(run):
@@ -248,9 +315,7 @@ def export(run):
     from taichi_edges.exporters.overlays import contact_sheet, draw_overlays
 
     edges, _ = read_edges(run.path("edges.json"))
-    views = read_views(run.path("views.npz"))
-    # Pictures of a synthetic scene lie in the run's own folder, and their paths are relative to it.
-    views = replace(views, image_paths=tuple(str(run.path(path)) if path else "" for path in views.image_paths))
+    views = with_whole_paths(run, read_views(run.path("views.npz")))
     written = []
     for suffix, write in EXPORTERS.items():
         path = run.path(f"edges{suffix}")
@@ -269,7 +334,7 @@ def export(run):
 def picture_files(run):
     """The colour images that the overlays are drawn on; those of a synthetic scene are its own."""
     source = run.config.source
-    if source.reader == "synthetic" or not source.images:
+    if source.reader == "synthetic":
         return []
     from taichi_edges.readers import READERS
 
@@ -287,7 +352,8 @@ def source_files(run):
 
     frames = READERS[source.reader](run.data_path(source.path, "source.path"), source)
     paths = [Path(path) for path in (*frames.edge_paths, *frames.image_paths) if path]
-    return [frames.where, *sorted({path for path in paths if path.is_file()}), *points]
+    models = [run.data_path(source.onnx.model, "source.onnx.model")] if source.detector == "onnx" else []
+    return [frames.where, *sorted({path for path in paths if path.is_file()}), *points, *models]
 
 
 def truth_files(run):

@@ -15,6 +15,7 @@ from taichi_edges.edgels import Edgels
 SIGMA_PER_WIDTH = 0.29  # 1 / (2 sqrt 3): the smallest scale at which a bar of that width has one ridge (Steger, eq. 17)
 MIN_SIGMA = 0.8  # px; below, the derivative of the Gaussian is not sampled well
 MIN_CURVATURE = 0.1  # of that of a line as narrow as the scale; on a flank rounding alone leaves a faint curvature
+HALF_PIXEL = 0.6  # px; a ridge between two pixels is 0.5 from either or, as values vary, some more: twice beats never
 MIN_PIXELS = 6  # a ridge of fewer is no line
 
 
@@ -63,7 +64,7 @@ def ridge_points(edge_map, sigma, threshold):
         offset = -(gx * nx + gy * ny) / curvature
     du, dv = offset * nx, offset * ny
     sharp = curvature < -MIN_CURVATURE * values / sigma**2
-    bright[rows, columns] = sharp & (np.abs(du) <= 0.5) & (np.abs(dv) <= 0.5)
+    bright[rows, columns] = sharp & (np.abs(du) <= HALF_PIXEL) & (np.abs(dv) <= HALF_PIXEL)
     on_ridge = _without_specks(bright, rows, columns)
     points = np.stack([left + columns + du, top + rows + dv], axis=1)[on_ridge]
     return points, np.stack([nx, ny], axis=1)[on_ridge], values[on_ridge]

@@ -53,7 +53,7 @@ class EdgelMatching:
 
     @cached_property
     def neighbors(self):
-        """(n, OWNED_MOST) indices of the edgels within OWNED_PX of each in its own view, itself included and repeated."""
+        """(n, OWNED_MOST) indices of the edgels within OWNED_PX of each in its view, itself included and repeated."""
         places = np.column_stack([self.edgels.points, APART * self.edgels.views])
         distances, near = cKDTree(places).query(places, OWNED_MOST, distance_upper_bound=OWNED_PX)
         return np.where(np.isfinite(distances), near, np.arange(len(places))[:, None])

@@ -68,17 +68,16 @@ def matrix(values, shape, where, key):
     return array
 
 
-def build_views(frames, config, box, progress, detect):
-    """Check the frames, get their edges and bring the scene box into the unit cube.
+def build_views(frames, edge_maps, edgels, config, box, progress):
+    """Check the cameras of frames whose edges are known, and bring the scene box into the unit cube.
 
-    config: the scene's `source` section. box: (2, 3) corners, input units. detect: function of the frames that gives
-    edge maps (V, H, W) uint8 and Edgels, or None in place of these.
+    edge_maps: (V, H, W) uint8. edgels: Edgels, or None where they are still to be traced. config: the scene's `source`
+    section. box: (2, 3) corners, input units.
     """
     poses = np.stack([matrix(pose, (4, 4), frames.where, f"the pose of {name}") for name, pose in _each(frames)])
     _check_poses(frames, poses)
     opengl = frames.opengl if config.axes == "auto" else config.axes == "opengl"
     poses = poses @ OPENGL_TO_OPENCV if opengl else poses
-    edge_maps, edgels = detect(frames)
     height, width = edge_maps.shape[1:]
     intrinsics = np.stack([intrinsics_for(width, height) for intrinsics_for in frames.intrinsics])
     _check_intrinsics(frames, intrinsics, width, height, progress)
