@@ -16,17 +16,19 @@ from taichi_edges.edgels import Edgels
 SCALES = (0.7, 1.5)
 REACH_SIGMAS = 3.5
 MIN_COVERAGE = 0.5
-FLOOR = 0.12
+BAND = 1.4
 CLUTTER_SIGMA = 2.0
 CLUTTER_WINDOW = 12.0
 LOW = 1.0
-NEEDED = 3.0
-CAP = 20.0
-TOTAL = 40.0
+NEEDED = 2.5
+CAP = 2.0
+TOTAL = 14.0
 HALF_WINDOW = 5
+WAVY = 5.0
+SMOOTH = 0.9
 MAX_TURN = np.cos(np.radians(50.0))
 HALF_SURE = 12.0
-NEIGHBOURS = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if r or c]
+NEIGHBOURS = [(r, c) for r in range(-2, 3) for c in range(-2, 3) if r or c]
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ def _clutter(field):
     small = ((field.gx.shape[1] + 1) // 2, (field.gx.shape[0] + 1) // 2)
     xx, yy, xy = (_smooth(cv2.resize(p, small, interpolation=cv2.INTER_AREA), max(CLUTTER_SIGMA, 1.5*field.sigma) / 2) for p in (hx * hx, hy * hy, hx * hy))
     across = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
-    floor = FLOOR / field.sigma
+    floor = BAND / (np.sqrt(2 * np.pi) * np.hypot(field.sigma, 0.3) * NEEDED)
     logs = 0.5 * np.log(np.maximum(across, 0) + floor**2)
     smooth = _smooth(logs, CLUTTER_WINDOW / 2)
     return cv2.resize(np.exp(smooth), field.gx.shape[::-1], interpolation=cv2.INTER_LINEAR)
@@ -94,8 +96,8 @@ def _clutter(field):
 def _maxima(field, clutter):
     squares = field.gx**2 + field.gy**2
     strong = np.sqrt(squares) * field.levels > LOW * clutter
-    strong[[0, -1]] = False
-    strong[:, [0, -1]] = False
+    strong[[0, 1, -2, -1]] = False
+    strong[:, [0, 1, -2, -1]] = False
     rows, columns = np.nonzero(strong)
     gx, gy = field.gx[rows, columns], field.gy[rows, columns]
     here = squares[rows, columns]
@@ -150,8 +152,8 @@ def _link(rows, columns, points, normals, shape):
         along = d[:, 1] * n[:, 0] - d[:, 0] * n[:, 1]
         aside = np.abs((d * n).sum(1)) + np.abs((d * m).sum(1))
         turn = (n * m).sum(1)
-        cost = aside + 0.5 * np.abs(along) + (1 - turn)
-        ok = turn > MAX_TURN
+        cost = aside + np.abs(along) + (1 - turn)
+        ok = (turn > MAX_TURN) & (aside < 2 * np.abs(along))
         for side in (0, 1):
             use = ok & ((along > 0) if side == 0 else (along < 0))
             i = own[use]
@@ -203,7 +205,9 @@ def _layer(field):
         return points, normals, ratio, rows, columns
     succ, pred = _link(rows, columns, points, normals, field.gx.shape)
     order, labels = _ordered(succ, pred)
-    score = np.clip(ratio[order] - NEEDED, -CAP, CAP)
+    score = np.clip(np.log(np.maximum(ratio[order], 0.1) / NEEDED), -CAP, CAP)
+    straight = np.hypot(*(_chain_means(normals[order, k], labels) for k in (0, 1)))
+    score = score - WAVY * np.maximum(SMOOTH - straight, 0)
     mean = _chain_means(score, labels)
     good = mean > 0
     breaks = np.concatenate([[True], (labels[1:] != labels[:-1]) | (good[1:] != good[:-1])])
@@ -213,6 +217,15 @@ def _layer(field):
     chosen = order[keep]
     ratios = _chain_means(ratio[order], labels)[keep]
     return points[chosen], normals[chosen], ratios, rows[chosen], columns[chosen]
+
+
+def _covered(taken, points, normals, reach):
+    covered = np.zeros(len(points), bool)
+    for step in np.arange(-np.ceil(reach), np.ceil(reach) + 1):
+        place = np.rint(points + step * normals).astype(np.int64)
+        rows = place[:, 1].clip(0, taken.shape[0] - 1)
+        covered |= taken[rows, place[:, 0].clip(0, taken.shape[1] - 1)] > 0
+    return covered
 
 
 def detect_edgels(image):
@@ -227,9 +240,7 @@ def detect_edgels(image):
         taken[found[-1][3], found[-1][4]] = 1
     for sigma in SCALES:
         layer = _layer(_colour_field(planes, picture.coverage, sigma))
-        size = 2 * int(np.ceil(1.5 * sigma)) + 1
-        near = cv2.dilate(taken, np.ones((size, size), np.uint8)) if sigma > SCALES[0] else cv2.dilate(taken, np.ones((3, 3), np.uint8))
-        free = near[layer[3], layer[4]] == 0
+        free = ~_covered(taken, layer[0], layer[1], 2 * sigma)
         found.append([a[free] for a in layer])
         taken[found[-1][3], found[-1][4]] = 1
     points, normals, ratios = (np.concatenate([layer[k] for layer in found]) for k in range(3))
