@@ -132,16 +132,27 @@ def measure_view(edgels, truth, image, mesh, lens, pose, map_path):
     normals = np.stack([-along[:, 1], along[:, 0]], axis=1)
     found, own_normals, _ = edgels
     away = cKDTree(found).query(pixels)[0]
-    outlines = contour_pixels(mesh, lens, pose, (height, width)) if mesh else np.argwhere(
-        cv2.morphologyEx(alpha, cv2.MORPH_GRADIENT, np.ones((3, 3))) > 127)[:, ::-1]
+    outlines = (
+        contour_pixels(mesh, lens, pose, (height, width))
+        if mesh
+        else np.argwhere(cv2.morphologyEx(alpha, cv2.MORPH_GRADIENT, np.ones((3, 3))) > 127)[:, ::-1]
+    )
     to_truth, nearest = cKDTree(pixels).query(found)
     lost = np.minimum(to_truth, cKDTree(outlines).query(found)[0]) > FAR_PX
     good = (to_truth < 2.0) & (np.abs((own_normals * normals[nearest]).sum(axis=1)) > PARALLEL)
     offsets = ((found - pixels[nearest]) * normals[nearest]).sum(axis=1)[good]
     sides = outline_sides(alpha, pixels, normals)[nearest][good]
     crease = outline_sides(alpha, pixels, normals) == 0
-    return dict(away=away, crease=crease, lost=lost, offsets=offsets, normals=normals[nearest][good], sides=sides,
-                own=own_normals[good], length=len(found))
+    return dict(
+        away=away,
+        crease=crease,
+        lost=lost,
+        offsets=offsets,
+        normals=normals[nearest][good],
+        sides=sides,
+        own=own_normals[good],
+        length=len(found),
+    )
 
 
 def report(name, rows):

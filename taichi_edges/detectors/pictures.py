@@ -27,11 +27,12 @@ class Picture:
     """light: (H, W, 1 or 3) float32, linear light of the object, 1 = white; 3 channels as OpenCV orders them, BGR.
 
     coverage: (H, W) float32, 0..1, the share of each pixel that the object covers; None where it covers all of them.
-    Where it is 0, `light` means nothing.
+    Where it is 0, `light` means nothing. exponent: of the encoding, None for sRGB; what `levels_per_light` wants.
     """
 
     light: np.ndarray
     coverage: np.ndarray | None = None
+    exponent: float | None = None
 
 
 def light_of_srgb(values):
@@ -41,39 +42,47 @@ def light_of_srgb(values):
     return np.where(values <= SRGB_LINEAR, values / SRGB_SLOPE, power).astype(np.float32)
 
 
-def srgb_slope(light):
-    """How fast the sRGB-encoded value grows with the light, both in 0..1; same shape as `light`."""
-    bend = SRGB_LINEAR / SRGB_SLOPE
-    power = (1 + SRGB_OFFSET) / SRGB_POWER * np.maximum(light, bend) ** (1 / SRGB_POWER - 1)
-    return np.where(light <= bend, SRGB_SLOPE, power).astype(np.float32)
+def levels_per_light(light, exponent=None):
+    """Grey levels of 255 by which the encoded value grows per unit of light, float32, same shape as `light`.
+
+    exponent: None for sRGB.
+    """
+    bend, scale, power = SRGB_LINEAR / SRGB_SLOPE, 1 + SRGB_OFFSET, SRGB_POWER
+    if exponent is not None:
+        bend, scale, power = 255.0**-exponent, 1.0, exponent  # the light of one grey level; below, the slope is endless
+    slope = np.maximum(light, np.float32(bend)) ** np.float32(1 / power - 1)
+    slope *= 255 * scale / power
+    return slope
 
 
-def as_picture(image):
+def as_picture(image, exponent=None):
     """Picture of a decoded image, (H, W), (H, W, 1), (H, W, 3) BGR, or with straight alpha (H, W, 2) or (H, W, 4).
 
     8 and 16 bits are sRGB-encoded, which is what PNG and JPEG files of either depth hold unless they say otherwise;
     floats (EXR, HDR, TIFF) are linear light, 1 = white. Alpha is linear in all of them.
+    exponent: light = value ** exponent instead of sRGB, for images that are encoded otherwise: 1 where edges were
+    smoothed in the encoded values, as drawing programs do; 5 to 7 resembles the "Filmic" tones of Blender.
     """
     image = image[:, :, None] if image.ndim == 2 else image
     colours = image.shape[2] - (image.shape[2] in (2, 4))
-    light = _decoded(image[:, :, :colours])
+    light = _decoded(image[:, :, :colours], exponent)
     if colours == image.shape[2]:
-        return Picture(light)
+        return Picture(light, exponent=exponent)
     full = 1.0 if image.dtype.kind == "f" else np.iinfo(image.dtype).max
     coverage = np.clip(image[:, :, -1].astype(np.float32) / full, 0.0, 1.0)
-    return Picture(light, None if coverage.min() == 1.0 else coverage)
+    return Picture(light, None if coverage.min() == 1.0 else coverage, exponent)
 
 
-def _decoded(values):
+def _decoded(values, exponent):
     """(H, W, C) float32 linear light."""
     if values.dtype.kind == "f":
         return np.nan_to_num(values.astype(np.float32), nan=0.0, posinf=1.0, neginf=0.0)
-    levels = np.iinfo(values.dtype).max
-    return light_of_srgb(np.arange(levels + 1) / levels)[values]
+    shades = np.linspace(0.0, 1.0, np.iinfo(values.dtype).max + 1)
+    return (light_of_srgb(shades) if exponent is None else (shades**exponent).astype(np.float32))[values]
 
 
-def read_picture(path):
-    """Picture of an image file; UserError where it cannot be read."""
+def read_picture(path, exponent=None):
+    """Picture of an image file; UserError where it cannot be read. exponent: see `as_picture`."""
     path = Path(path)
     if not path.is_file():
         raise UserError(f"{path}: no such image; check the folder of the images, or leave this view out")
@@ -84,4 +93,4 @@ def read_picture(path):
         raise UserError(f"{path}: {problem}; copy or export it again, or leave this view out")
     if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
         raise UserError(f"{path}: pixels of type {image.dtype}; export it with 8 or 16 bits a channel")
-    return as_picture(image)
+    return as_picture(image, exponent)

@@ -1,5 +1,21 @@
-"""Edgels straight from pictures, at sub-pixel accuracy."""
+"""Edgels straight from pictures: where the light changes fastest, at sub-pixel accuracy (after Canny, PAMI 1986).
 
+For each scale, the fine ones first:
+
+1. The gradient of the light, of that of three opponent colours which is steepest: an edge between equally bright
+   colours counts like any other. The outline of a picture with transparency is a layer of its own.
+2. The clutter around each pixel: how much the gradient varies in the direction along an edge. A straight edge, or a
+   grid of them, has none; noise and texture vary in all directions alike.
+3. Maxima of the gradient across the edge, at sub-pixel positions. Their ratio says how far they stand out: of what
+   is beside them (a smooth shading, however steep, does not) in units of the clutter.
+4. Maxima are linked into chains, and every maximum of a chain is a vote for or against an edge here: the logarithm of
+   its ratio, less what the chain winds. Votes add up along a chain, so that a long smooth chain may be faint, while
+   noise, whose votes are negative, never gathers enough.
+
+A coarse scale adds what the finer ones did not find: edges that drown in noise, and blurred ones.
+"""
+
+import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
@@ -9,43 +25,144 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from taichi_edges.detectors.pictures import Picture, as_picture, read_picture, srgb_slope
+from taichi_edges.detectors.pictures import Picture, as_picture, levels_per_light, read_picture
 from taichi_edges.detectors.ridges import gaussian_derivatives
 from taichi_edges.edgels import Edgels
 
+# px, smoothing. The first is about the smallest whose derivative is sampled well: it keeps edges 2 px apart separate
+# and moves a rim of radius r by 0.25 / r px only. Noise of the gradient falls with the square of the scale.
 SCALES = (0.7, 1.5)
-REACH_SIGMAS = 3.5
-MIN_COVERAGE = 0.5
-BAND = 1.4
-CLUTTER_SIGMA = 2.0
-CLUTTER_WINDOW = 12.0
-LOW = 1.0
-NEEDED = 2.5
-CAP = 2.0
-TOTAL = 14.0
-HALF_WINDOW = 5
-WAVY = 5.0
-SMOOTH = 0.9
-MAX_TURN = np.cos(np.radians(50.0))
-HALF_SURE = 12.0
-NEIGHBOURS = [(r, c) for r in range(-2, 3) for c in range(-2, 3) if r or c]
+PIXEL_SIGMA = 0.3  # px; a pixel sees the mean over its area, which blurs like a Gaussian of sqrt(1 / 12)
+MIN_COVERAGE = 0.5  # of a smoothed pixel by the object; the object's colour is not looked at farther out
+MARGIN = 2  # px at the image's border where no edgel is looked for: as far as a link reaches
+
+# Grey levels of 255: a lower step does not count. Steps of one level are what rounding makes of smooth shading.
+MIN_STEP = 1.4
+CLUTTER_SIGMA = 2.0  # px; directions are compared over so much, which is short against the curves of most edges
+CLUTTER_WINDOW = 12.0  # px; the clutter's mean is taken over so much, wide against the neighbourhood of one edge
+BESIDE = 3.5  # blurs of the edge; there its own gradient is nearly gone (0.2 %)
+
+LOW = 1.25  # times the clutter; less is no candidate
+NEEDED = 2.5  # ratio of a maximum that speaks neither for nor against an edge; noise has maxima of 1.5 to 2.5
+MOST = 3.0  # votes of one maximum at most, for or against: reached at 20 times the ratio needed
+ENOUGH = 18.0  # votes for an edge: 6 maxima that are as clear as can be, or 45 of a ratio of 1.5 times what is needed
+WINDOW = 5  # maxima to each side that are asked whether the edge goes on here
+STRAIGHT = 0.9  # mean of the unit normals over the window; a circle with a radius of 7 px has it
+WINDING = 5.0  # votes lost when the mean of the normals falls by 1
+MAX_TURN = np.cos(np.radians(50.0))  # from one maximum to the next of a chain
+MIN_RUN = 5  # maxima; what remains of a coarse chain beside finer ones must be longer
+HALF_SURE = 12.0  # ratio of an edge that gets the strength 0.5
+
+# BGR to opponent colours of equal noise: brightness, red against blue, green against both.
+OPPONENT = np.array([[1, 1, 1], [-(1.5**0.5), 0, 1.5**0.5], [-(0.5**0.5), 2**0.5, -(0.5**0.5)]], np.float32) / 3
+NEAR = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if down or right]
+GAPS = [(down, right) for down in range(-2, 3) for right in range(-2, 3) if max(abs(down), abs(right)) == 2]
 
 
 @dataclass(frozen=True)
 class Field:
-    """gx, gy: (H, W) linear light per pixel; levels: (H, W) grey levels per linear unit."""
+    """The gradient of one layer at one scale.
+
+    gx, gy: (H, W) float32, light per pixel. levels: (H, W) float32, grey levels per unit of light. sigma: pixels.
+    """
 
     gx: np.ndarray
     gy: np.ndarray
     levels: np.ndarray
     sigma: float
 
+    @property
+    def blur(self):
+        """Pixels: the Gaussian that a sharp edge has become."""
+        return float(np.hypot(self.sigma, PIXEL_SIGMA))
 
-def _opponent(light):
-    if light.shape[2] == 1:
-        return light
-    turn = np.array([[1 / 3, 1 / 3, 1 / 3], [-(6**-0.5), 0, 6**-0.5], [-(18**-0.5), 2 * 18**-0.5, -(18**-0.5)]])
-    return cv2.transform(light, turn.astype(np.float32))
+
+@dataclass(frozen=True)
+class Maxima:
+    """Maxima of the gradient across the edge.
+
+    rows, columns: (n,) their pixels. points: (n, 2) pixels (u, v). normals: (n, 2) unit, towards more light.
+    ratios: (n,) how far they stand out of what is beside them, in units of the clutter.
+    """
+
+    rows: np.ndarray
+    columns: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+    ratios: np.ndarray
+
+    def __len__(self):
+        return len(self.rows)
+
+    def take(self, chosen):
+        """Some of them, by index or mask."""
+        return Maxima(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+
+
+def trace_pictures(paths, threads=None, report=None, exponent=None):
+    """Edgels of images, a few of which are held at a time.
+
+    paths: (V,) image files, '' for a view without one, which has no edgels. threads: None for one per core; the
+    result does not depend on it. report: called with the number of views that are done. exponent: see `as_picture`.
+    UserError where an image cannot be read.
+    """
+
+    def trace(path):
+        return detect_edgels(read_picture(path, exponent)) if path else _arrays([])
+
+    views = []
+    pool = ThreadPoolExecutor(threads or os.cpu_count())  # OpenCV and NumPy release the lock in the long loops
+    try:
+        for view in pool.map(trace, paths):
+            views.append(view)
+            if report:
+                report(len(views))
+    finally:
+        pool.shutdown(cancel_futures=True)  # of no use any more when one image cannot be read
+    return Edgels.of_views(views)
+
+
+def detect_edgels(image):
+    """Edgels of one image: a Picture, or an array that `as_picture` accepts.
+
+    Returns points (n, 2) as (u, v), pixel centres at integers, about one for each pixel of an edge's length; unit
+    normals (n, 2) across the edge, towards more light; strengths (n,) in 0..1: r / (r + HALF_SURE) for an edge that
+    stands out r times from the clutter around it. The faintest have about 0.2, and clear ones more than 0.5.
+    """
+    picture = image if isinstance(image, Picture) else as_picture(image)
+    shape = picture.light.shape[:2]
+    if min(shape) <= 2 * MARGIN:
+        return _arrays([])
+    taken = np.zeros(shape, bool)  # pixels with an edgel
+    layers = []
+    for field in _fields(picture):
+        edges, runs = _chained(_maxima(field, _clutter(field)), shape)
+        free = ~_beside_taken(taken, edges, 2 * field.sigma)
+        layers.append(edges.take(_long_runs(free, runs)))
+        taken[layers[-1].rows, layers[-1].columns] = True
+    return _arrays(layers)
+
+
+def _arrays(layers):
+    """Points (n, 2), normals (n, 2) and strengths (n,) of several Maxima."""
+    points, normals = (
+        np.concatenate([np.zeros((0, 2)), *(getattr(layer, name) for layer in layers)])
+        for name in ("points", "normals")
+    )
+    ratios = np.concatenate([np.zeros(0), *(layer.ratios for layer in layers)]).clip(min=0.0)
+    return points, normals, ratios / (ratios + HALF_SURE)
+
+
+def _fields(picture):
+    """The Fields of a picture, one after the other: the outline, then the colours from fine to coarse."""
+    coverage, light = picture.coverage, picture.light
+    if coverage is not None:
+        gx, gy = islice(gaussian_derivatives(coverage, SCALES[0]), 2)
+        yield Field(gx, gy, np.full(coverage.shape, 255, np.float32), SCALES[0])
+    light = cv2.transform(light, OPPONENT) if light.shape[2] == 3 else light[:, :, 0]
+    for sigma in SCALES:
+        gradients, mean = _steepest(*_derivatives(light, coverage, sigma))
+        yield Field(*gradients, levels_per_light(mean, picture.exponent), sigma)
 
 
 def _smooth(image, sigma):
@@ -53,205 +170,219 @@ def _smooth(image, sigma):
     return cv2.GaussianBlur(image, (size, size), sigma, borderType=cv2.BORDER_REPLICATE)
 
 
-def _colour_field(planes, coverage, sigma):
-    planes = planes if planes.shape[2] > 1 else planes[:, :, 0]
+def _derivatives(light, coverage, sigma):
+    """Derivatives of the light along x and y, and its mean, each (H, W) or (H, W, 3), smoothed by `sigma` pixels.
+
+    Where the object covers a part of the pixels, only that part counts (normalised convolution: Knutsson and Westin,
+    CVPR 1993): the outline leaves no trace in the colours beside it.
+    """
     if coverage is None:
-        gx, gy = islice(gaussian_derivatives(planes, sigma), 2)
-        mean = _smooth(planes, sigma)
-    else:
-        share = _smooth(coverage, sigma)
-        inside = share > MIN_COVERAGE
-        inverse = np.where(inside, 1 / np.maximum(share, MIN_COVERAGE), 0).astype(np.float32)
-        inverse = inverse if planes.ndim == 2 else inverse[:, :, None]
-        weighted = planes * (coverage if planes.ndim == 2 else coverage[:, :, None])
-        mean = _smooth(weighted, sigma) * inverse
-        gx, gy = (
-            (whole - mean * (own if planes.ndim == 2 else own[:, :, None])) * inverse
-            for whole, own in zip(islice(gaussian_derivatives(weighted, sigma), 2), islice(gaussian_derivatives(coverage, sigma), 2))
-        )
-    if planes.ndim == 2:
-        return Field(gx, gy, 255 * srgb_slope(mean), sigma)
+        gx, gy = islice(gaussian_derivatives(light, sigma), 2)
+        return gx, gy, _smooth(light, sigma)
+    share = _smooth(coverage, sigma)
+    inverse = np.where(share > MIN_COVERAGE, 1 / np.maximum(share, MIN_COVERAGE), 0).astype(np.float32)
+    of_coverage = islice(gaussian_derivatives(coverage, sigma), 2)
+    if light.ndim == 3:
+        coverage, inverse = coverage[:, :, None], inverse[:, :, None]
+        of_coverage = (own[:, :, None] for own in of_coverage)
+    covered = light * coverage
+    mean = _smooth(covered, sigma) * inverse
+    both = zip(gaussian_derivatives(covered, sigma), of_coverage, strict=False)  # the first two of five
+    gx, gy = ((whole - mean * own) * inverse for whole, own in islice(both, 2))
+    return gx, gy, mean
+
+
+def _steepest(gx, gy, mean):
+    """Gradient (gx, gy), (H, W) each, of the colour in which it is steepest, and the mean brightness (H, W)."""
+    if gx.ndim == 2:
+        return (gx, gy), mean
     x, y = gx[:, :, 0].copy(), gy[:, :, 0].copy()
-    best = x * x + y * y
-    for c in (1, 2):
-        own = gx[:, :, c] ** 2 + gy[:, :, c] ** 2
-        more = own > best
-        np.copyto(x, gx[:, :, c], where=more)
-        np.copyto(y, gy[:, :, c], where=more)
-        np.copyto(best, own, where=more)
-    return Field(x, y, 255 * srgb_slope(mean[:, :, 0]), sigma)
+    steepest = x * x + y * y
+    for colour in range(1, gx.shape[2]):
+        square = gx[:, :, colour] ** 2 + gy[:, :, colour] ** 2
+        steeper = square > steepest
+        for best, own in ((x, gx[:, :, colour]), (y, gy[:, :, colour]), (steepest, square)):
+            np.copyto(best, own, where=steeper)
+    return (x, y), np.ascontiguousarray(mean[:, :, 0])
 
 
 def _clutter(field):
-    hx, hy = field.gx * field.levels, field.gy * field.levels
-    small = ((field.gx.shape[1] + 1) // 2, (field.gx.shape[0] + 1) // 2)
-    xx, yy, xy = (_smooth(cv2.resize(p, small, interpolation=cv2.INTER_AREA), max(CLUTTER_SIGMA, 1.5*field.sigma) / 2) for p in (hx * hx, hy * hy, hx * hy))
-    across = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
-    floor = BAND / (np.sqrt(2 * np.pi) * np.hypot(field.sigma, 0.3) * NEEDED)
-    logs = 0.5 * np.log(np.maximum(across, 0) + floor**2)
-    smooth = _smooth(logs, CLUTTER_WINDOW / 2)
-    return cv2.resize(np.exp(smooth), field.gx.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    """(H, W) float32: grey levels per pixel by which the gradient varies along the edges, or by which rounding varies it.
+
+    That is the root of the smaller eigenvalue of the structure tensor. The mean is geometric: corners count little.
+    """
+    height, width = field.gx.shape
+    half = ((width + 1) // 2, (height + 1) // 2)  # half the resolution is plenty and takes a quarter of the time
+    gx, gy = field.gx * field.levels, field.gy * field.levels
+    sigma = max(CLUTTER_SIGMA, 1.5 * field.sigma) / 2
+    xx, yy, xy = (_smooth(cv2.resize(a, half, interpolation=cv2.INTER_AREA), sigma) for a in (gx**2, gy**2, gx * gy))
+    smaller = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
+    floor = MIN_STEP / (np.sqrt(2 * np.pi) * field.blur * NEEDED)  # the steepest gradient of a step of MIN_STEP
+    logs = _smooth(0.5 * np.log(np.maximum(smaller, 0) + floor**2), CLUTTER_WINDOW / 2)
+    return cv2.resize(np.exp(logs), (width, height), interpolation=cv2.INTER_LINEAR)
 
 
 def _maxima(field, clutter):
+    """Maxima of the gradient along its own direction that stand out of the clutter, (H, W), at least LOW times."""
     squares = field.gx**2 + field.gy**2
-    strong = np.sqrt(squares) * field.levels > LOW * clutter
-    strong[[0, 1, -2, -1]] = False
-    strong[:, [0, 1, -2, -1]] = False
+    rows, columns = _candidates(field, squares, clutter)
+    gx, gy = field.gx[rows, columns], field.gy[rows, columns]
+    size = np.sqrt(squares[rows, columns])
+    normals = np.stack([gx, gy], axis=1) / size[:, None]
+    offsets = _offsets(squares, rows, columns, normals)
+    points = np.stack([columns, rows], axis=1) + offsets[:, None] * normals
+    standing_out = size - _beside(field, rows, columns, normals)
+    ratios = standing_out * (field.levels / clutter)[rows, columns]
+    return Maxima(rows, columns, points, normals, ratios).take(np.abs(offsets) < 1)
+
+
+def _candidates(field, squares, clutter):
+    """Rows and columns (n,) of the pixels whose gradient is larger than those before and behind it.
+
+    The two are interpolated between the pixels where the gradient's direction meets the ring of eight around it.
+    """
+    strong = squares * field.levels**2 > (LOW * clutter) ** 2
+    strong[:MARGIN] = strong[-MARGIN:] = strong[:, :MARGIN] = strong[:, -MARGIN:] = False
     rows, columns = np.nonzero(strong)
     gx, gy = field.gx[rows, columns], field.gy[rows, columns]
-    here = squares[rows, columns]
-    flat = squares.reshape(-1)
-    width = squares.shape[1]
-    centre = rows * width + columns
+    width, flat = squares.shape[1], squares.reshape(-1)
+    right, down = np.where(gx < 0, -1, 1), np.where(gy < 0, -width, width)
     steep = np.abs(gy) > np.abs(gx)
-    dx, dy = np.where(gx < 0, -1, 1), np.where(gy < 0, -width, width)
-    major = np.where(steep, dy, dx)
-    slant = np.where(steep, np.abs(gx), np.abs(gy)) / np.maximum(np.maximum(np.abs(gx), np.abs(gy)), 1e-12)
-    ahead = (1 - slant) * flat[centre + major] + slant * flat[centre + dx + dy]
-    behind = (1 - slant) * flat[centre - major] + slant * flat[centre - dx - dy]
-    top = (here > behind) & (here >= ahead)
-    rows, columns, centre = rows[top], columns[top], centre[top]
-    size = np.sqrt(here[top])
-    nx, ny = gx[top] / size, gy[top] / size
-    logs = {(r, c): np.log(flat[centre + r * width + c] + 1e-20) for r in (-1, 0, 1) for c in (-1, 0, 1)}
-    lx, ly = (logs[0, 1] - logs[0, -1]) / 2, (logs[1, 0] - logs[-1, 0]) / 2
-    lxx, lyy = logs[0, 1] - 2 * logs[0, 0] + logs[0, -1], logs[1, 0] - 2 * logs[0, 0] + logs[-1, 0]
-    lxy = (logs[1, 1] - logs[1, -1] - logs[-1, 1] + logs[-1, -1]) / 4
-    bend = lxx * nx * nx + 2 * lxy * nx * ny + lyy * ny * ny
-    with np.errstate(divide="ignore", invalid="ignore"):
-        offset = -(lx * nx + ly * ny) / bend
-    ok = (bend < 0) & (np.abs(offset) < 1)
-    rows, columns, nx, ny, size, offset = (a[ok] for a in (rows, columns, nx, ny, size, offset))
-    points = np.stack([columns + offset * nx, rows + offset * ny], axis=1)
-    reach = REACH_SIGMAS * np.hypot(field.sigma, 0.3)
-    aside = 0
-    for side in (-reach, reach):
-        r = np.rint(rows + side * ny).astype(int).clip(0, squares.shape[0] - 1)
-        c = np.rint(columns + side * nx).astype(int).clip(0, width - 1)
-        aside = aside + 0.5 * (field.gx[r, c] * nx + field.gy[r, c] * ny)
-    ratio = (size - aside) * (field.levels / clutter)[rows, columns]
-    return rows, columns, points, np.stack([nx, ny], axis=1), ratio
+    major, minor = np.where(steep, down, right), np.where(steep, right, down)
+    slant = np.minimum(np.abs(gx), np.abs(gy)) / np.maximum(np.abs(gx), np.abs(gy))
+    centre = rows * width + columns
+    before = (1 - slant) * flat[centre - major] + slant * flat[centre - major - minor]
+    behind = (1 - slant) * flat[centre + major] + slant * flat[centre + major + minor]
+    top = (flat[centre] > before) & (flat[centre] >= behind)
+    return rows[top], columns[top]
 
 
-def _link(rows, columns, points, normals, shape):
-    """succ (n,) int, -1 none; mutual"""
-    count = len(rows)
+def _offsets(squares, rows, columns, normals):
+    """(n,) pixels from the pixel's centre to the maximum along the normal; infinite where there is none.
+
+    The gradient across a blurred step is a Gaussian, the logarithm of which is a parabola: differences over the eight
+    neighbours give its top without error.
+    """
+    width, flat = squares.shape[1], squares.reshape(-1)
+    centre = rows * width + columns
+    tiny = np.finfo(np.float32).tiny
+    log = {
+        (down, right): np.log(flat[centre + down * width + right] + tiny) for down, right in [(0, 0), *NEAR]
+    }  # of the squares
+    x, y = (log[0, 1] - log[0, -1]) / 2, (log[1, 0] - log[-1, 0]) / 2
+    xx, yy = log[0, 1] - 2 * log[0, 0] + log[0, -1], log[1, 0] - 2 * log[0, 0] + log[-1, 0]
+    xy = (log[1, 1] - log[1, -1] - log[-1, 1] + log[-1, -1]) / 4
+    nx, ny = normals.T
+    curvature = xx * nx * nx + 2 * xy * nx * ny + yy * ny * ny
+    slope = x * nx + y * ny
+    return np.divide(-slope, curvature, out=np.full(len(rows), np.inf), where=curvature < 0)
+
+
+def _beside(field, rows, columns, normals):
+    """(n,) mean of the gradients on both sides of the edges, along their normals."""
+    height, width = field.gx.shape
+    total = np.zeros(len(rows))
+    for step in (-BESIDE * field.blur, BESIDE * field.blur):
+        right = np.rint(columns + step * normals[:, 0]).astype(np.int64).clip(0, width - 1)
+        down = np.rint(rows + step * normals[:, 1]).astype(np.int64).clip(0, height - 1)
+        total += field.gx[down, right] * normals[:, 0] + field.gy[down, right] * normals[:, 1]
+    return total / 2
+
+
+def _chained(maxima, shape):
+    """The Maxima that are edges, along their chains, ratios averaged there; and (n,) int, the run each belongs to."""
+    order, low, high = _ordered(*_links(maxima, shape))
+    maxima = maxima.take(order)
+
+    def mean(values):
+        sums = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
+        return (sums[high] - sums[low]) / (high - low)
+
+    straight = np.hypot(mean(maxima.normals[:, 0]), mean(maxima.normals[:, 1]))
+    votes = np.log(np.maximum(maxima.ratios / NEEDED, np.exp(-MOST))).clip(max=MOST)
+    votes -= WINDING * np.maximum(STRAIGHT - straight, 0.0)
+    goes_on = mean(votes) > 0
+    chain_starts = np.concatenate([[False], low[1:] > high[:-1] - 1])
+    runs = np.cumsum(chain_starts | np.concatenate([[False], goes_on[1:] != goes_on[:-1]]))
+    kept = goes_on & (np.bincount(runs, votes)[runs] >= ENOUGH) if len(runs) else goes_on
+    smoothed = Maxima(maxima.rows, maxima.columns, maxima.points, maxima.normals, mean(maxima.ratios))
+    return smoothed.take(kept), runs[kept]
+
+
+def _links(maxima, shape):
+    """(n,) index of the next maximum of the chain, light on one side throughout, -1 at its end; the same backwards.
+
+    Two are linked when each is the best of the other's neighbours; over a gap of one pixel where there is no nearer.
+    """
+    count = len(maxima)
     place = np.full(shape, -1, np.int32)
-    place[rows, columns] = np.arange(count)
-    flat = place.reshape(-1)
-    centre = rows * shape[1] + columns
-    best = np.full((2, count), np.inf)
-    who = np.full((2, count), -1)
-    for r, c in NEIGHBOURS:
-        other = flat[centre + r * shape[1] + c]
-        own = np.flatnonzero(other >= 0)
-        other = other[own]
-        n, m = normals[own], normals[other]
-        d = points[other] - points[own]
-        along = d[:, 1] * n[:, 0] - d[:, 0] * n[:, 1]
-        aside = np.abs((d * n).sum(1)) + np.abs((d * m).sum(1))
-        turn = (n * m).sum(1)
-        cost = aside + np.abs(along) + (1 - turn)
-        ok = (turn > MAX_TURN) & (aside < 2 * np.abs(along))
-        for side in (0, 1):
-            use = ok & ((along > 0) if side == 0 else (along < 0))
-            i = own[use]
-            better = cost[use] < best[side, i]
-            best[side, i[better]] = cost[use][better]
-            who[side, i[better]] = other[use][better]
-    succ, pred = who
-    mutual = (succ >= 0) & (pred[succ] == np.arange(count))
-    succ = np.where(mutual, succ, -1)
-    pred = np.full(count, -1)
-    pred[succ[mutual]] = np.flatnonzero(mutual)
-    return succ, pred
+    place[maxima.rows, maxima.columns] = np.arange(count)
+    costs, partners = np.full((2, count), np.inf, np.float32), np.full((2, count), -1)
+    for ring in (NEAR, GAPS):
+        lonely = np.flatnonzero((partners < 0).any(axis=0))
+        centre = maxima.rows[lonely] * shape[1] + maxima.columns[lonely]
+        for down, right in ring:
+            others = place.reshape(-1)[centre + down * shape[1] + right]
+            _offer(maxima, lonely[others >= 0], others[others >= 0], costs, partners)
+    ahead, behind = partners
+    mutual = (ahead >= 0) & (behind[ahead] == np.arange(count))
+    ahead = np.where(mutual, ahead, -1)
+    behind = np.full(count, -1)
+    behind[ahead[mutual]] = np.flatnonzero(mutual)
+    return ahead, behind
 
 
-def _ordered(succ, pred):
-    """order, chain starts along order"""
-    count = len(succ)
-    i = np.flatnonzero(succ >= 0)
-    graph = coo_array((np.ones(len(i), bool), (i, succ[i])), shape=(count, count))
-    _, labels = connected_components(graph, directed=False)
-    has_head = np.zeros(labels.max(initial=-1) + 1, bool)
-    has_head[labels[pred < 0]] = True
-    first = np.full(len(has_head), count)
+def _offer(maxima, ours, others, costs, partners):
+    """Take each of the others for the neighbour of ours where it is better than the one so far; changes both arrays."""
+    ux, uy = maxima.normals[ours].T
+    vx, vy = maxima.normals[others].T
+    x, y = (maxima.points[others] - maxima.points[ours]).T
+    along = ux * y - uy * x
+    aside = np.abs(x * ux + y * uy) + np.abs(x * vx + y * vy)
+    turn = ux * vx + uy * vy
+    cost = aside + np.abs(along) + 1 - turn
+    fits = (turn > MAX_TURN) & (aside < 2 * np.abs(along))
+    for side, mine in enumerate((along > 0, along < 0)):
+        better = fits & mine & (cost < costs[side, ours])
+        costs[side, ours[better]] = cost[better]
+        partners[side, ours[better]] = others[better]
+
+
+def _ordered(ahead, behind):
+    """(n,) the maxima chain by chain, each in order; and (n,) in that order, the window around each: low .. high - 1."""
+    count = len(ahead)
+    linked = np.flatnonzero(ahead >= 0)
+    graph = coo_array((np.ones(len(linked), bool), (linked, ahead[linked])), shape=(count, count))
+    chains, labels = connected_components(graph, directed=False) if count else (0, np.zeros(0, np.int32))
+    open_chain = np.zeros(chains, bool)
+    open_chain[labels[behind < 0]] = True
+    first = np.full(chains, count)
     np.minimum.at(first, labels, np.arange(count))
-    pred = pred.copy()
-    pred[first[~has_head]] = -1
-    rank, jump = (pred >= 0).astype(np.int64), pred.copy()
-    while (jump >= 0).any():
-        rank = rank + np.where(jump >= 0, rank[jump], 0)
-        jump = np.where(jump >= 0, jump[jump], -1)
-    order = np.lexsort((rank, labels))
-    return order, labels[order]
+    behind = behind.copy()
+    behind[first[~open_chain]] = -1  # a closed chain is cut at its first pixel
+    ranks = (behind >= 0).astype(np.int64)
+    while (behind >= 0).any():  # each looks twice as far back as before
+        ranks += np.where(behind >= 0, ranks[behind], 0)
+        behind = np.where(behind >= 0, behind[behind], -1)
+    order = np.lexsort((ranks, labels))
+    ends = np.cumsum(np.bincount(labels, minlength=chains))
+    starts = np.concatenate([[0], ends])[:-1]
+    here, label = np.arange(count), labels[order]
+    return order, np.maximum(here - WINDOW, starts[label]), np.minimum(here + WINDOW + 1, ends[label])
 
 
-def _chain_means(values, labels):
-    count = len(values)
-    starts = np.searchsorted(labels, labels, "left")
-    ends = np.searchsorted(labels, labels, "right")
-    sums = np.concatenate([[0], np.cumsum(values)])
-    i = np.arange(count)
-    low, high = np.maximum(i - HALF_WINDOW, starts), np.minimum(i + HALF_WINDOW + 1, ends)
-    return (sums[high] - sums[low]) / (high - low)
-
-
-def _layer(field):
-    clutter = _clutter(field)
-    rows, columns, points, normals, ratio = _maxima(field, clutter)
-    if len(rows) == 0:
-        return points, normals, ratio, rows, columns
-    succ, pred = _link(rows, columns, points, normals, field.gx.shape)
-    order, labels = _ordered(succ, pred)
-    score = np.clip(np.log(np.maximum(ratio[order], 0.1) / NEEDED), -CAP, CAP)
-    straight = np.hypot(*(_chain_means(normals[order, k], labels) for k in (0, 1)))
-    score = score - WAVY * np.maximum(SMOOTH - straight, 0)
-    mean = _chain_means(score, labels)
-    good = mean > 0
-    breaks = np.concatenate([[True], (labels[1:] != labels[:-1]) | (good[1:] != good[:-1])])
-    piece = np.cumsum(breaks) - 1
-    total = np.bincount(piece, np.where(good, score, 0))
-    keep = good & (total >= TOTAL)[piece]
-    chosen = order[keep]
-    ratios = _chain_means(ratio[order], labels)[keep]
-    return points[chosen], normals[chosen], ratios, rows[chosen], columns[chosen]
-
-
-def _covered(taken, points, normals, reach):
-    covered = np.zeros(len(points), bool)
+def _beside_taken(taken, maxima, reach):
+    """(n,) bool: is one of the pixels across each edge, up to `reach` away, taken? taken: (H, W) bool."""
+    height, width = taken.shape
+    result = np.zeros(len(maxima), bool)
     for step in np.arange(-np.ceil(reach), np.ceil(reach) + 1):
-        place = np.rint(points + step * normals).astype(np.int64)
-        rows = place[:, 1].clip(0, taken.shape[0] - 1)
-        covered |= taken[rows, place[:, 0].clip(0, taken.shape[1] - 1)] > 0
-    return covered
+        columns, rows = np.rint(maxima.points + step * maxima.normals).astype(np.int64).T
+        result |= taken[rows.clip(0, height - 1), columns.clip(0, width - 1)]
+    return result
 
 
-def detect_edgels(image):
-    picture = image if isinstance(image, Picture) else as_picture(image)
-    planes = _opponent(picture.light)
-    shape = planes.shape[:2]
-    found = []
-    taken = np.zeros(shape, np.uint8)
-    if picture.coverage is not None:
-        gx, gy = islice(gaussian_derivatives(picture.coverage, SCALES[0]), 2)
-        found.append(_layer(Field(gx, gy, np.full(shape, 255, np.float32), SCALES[0])))
-        taken[found[-1][3], found[-1][4]] = 1
-    for sigma in SCALES:
-        layer = _layer(_colour_field(planes, picture.coverage, sigma))
-        free = ~_covered(taken, layer[0], layer[1], 2 * sigma)
-        found.append([a[free] for a in layer])
-        taken[found[-1][3], found[-1][4]] = 1
-    points, normals, ratios = (np.concatenate([layer[k] for layer in found]) for k in range(3))
-    return points, normals, (ratios / (ratios + HALF_SURE)).clip(0, 1)
-
-
-def trace_pictures(paths, threads=None, report=None):
-    def trace(path):
-        if not path:
-            return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
-        return detect_edgels(read_picture(path))
-
-    with ThreadPoolExecutor(threads) as pool:
-        return Edgels.of_views(pool.map(trace, paths))
+def _long_runs(free, runs):
+    """(n,) bool: which of the free edgels (n,) have MIN_RUN free ones in a row. runs: (n,) int, ascending."""
+    breaks = np.concatenate([[False], (free[1:] != free[:-1]) | (runs[1:] != runs[:-1])])[: len(free)]
+    parts = np.cumsum(breaks)
+    return free & (np.bincount(parts)[parts] >= MIN_RUN) if len(parts) else free
