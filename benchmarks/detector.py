@@ -1,0 +1,212 @@
+"""How near to exact edges are the edgels of the sub-pixel detector, and how many does it find?
+
+    python -m benchmarks.detector [scene ...]
+
+The exact CAD edges of three scenes are projected into their views. TAICHI_EDGES_DATA names the folder of the scenes.
+"""
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from taichi_edges.bezier import evaluate_bezier
+from taichi_edges.cameras import OPENGL_TO_OPENCV, inside_image, invert_pose, project
+from taichi_edges.detectors.ridges import ridge_points
+from taichi_edges.detectors.subpixel import trace_pictures
+from taichi_edges.synthetic.visibility import sample_segments
+
+SPACING = 0.002  # scene units between samples of an edge; about half a pixel
+HIDDEN = 0.004  # scene units; a surface so much in front of a sample hides it
+JITTER = 0.002  # scene units; a sample is seen when a point so near to it is
+STEP = 0.02  # scene units; a jump of the depth from pixel to pixel that is an occluding contour
+NEAR_PX, FAR_PX = 1.0, 3.0  # a true edge is found within NEAR_PX; an edgel farther than FAR_PX from every edge is false
+PARALLEL = np.cos(np.radians(30.0))  # an edgel measures an edge that runs as it does
+
+
+def read_emap(folder, images):
+    """Names, image paths, intrinsics (V, 3, 3), world_to_camera (V, 3, 4)."""
+    frames = json.loads((folder / "meta_data.json").read_text())["frames"]
+    names = [frame["rgb_path"] for frame in frames]
+    poses = invert_pose(np.array([frame["camtoworld"] for frame in frames]))
+    return names, [folder / images / name for name in names], np.array([f["intrinsics"] for f in frames]), poses
+
+
+def read_nerf(folder, images):
+    """As read_emap, of the train split."""
+    frames = json.loads((folder / "transforms_train.json").read_text())["frames"]
+    names = [Path(frame["file_path"]).name + ".png" for frame in frames]
+    poses = invert_pose(np.array([frame["transform_matrix"] for frame in frames]) @ OPENGL_TO_OPENCV)
+    return names, [folder / images / name for name in names], np.array([f["camera_intrinsics"] for f in frames]), poses
+
+
+def sharp_curves(path):
+    """Samples (n, 3) of the CAD edges and the unit tangents (n, 3) there."""
+    content = json.loads(path.read_text())
+    if "curves" in content:
+        lines = [np.array(curve["points"]) for curve in content["curves"]]
+    else:
+        controls = [np.array(edge["p"]) for edge in content["edges"]]
+        lines = [c if len(c) == 2 else evaluate_bezier(c, np.linspace(0, 1, 65)) for c in controls]
+    starts, ends = (np.concatenate([line[part] for line in lines]) for part in (np.s_[:-1], np.s_[1:]))
+    points, owners = sample_segments(starts, ends, SPACING)
+    tangents = (ends - starts)[owners]
+    return points, tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
+
+
+def read_mesh(folder):
+    """Ray-casting scene of the object's mesh in the scene's frame, or None."""
+    import open3d
+
+    found = [*folder.glob("mesh.ply"), *folder.glob("gt/*.obj")]
+    if not found:
+        return None
+    mesh = open3d.io.read_triangle_mesh(str(found[0]))
+    if found[0].suffix == ".obj":
+        frame = json.loads((folder / "gt/curves.json").read_text())
+        vertices = np.asarray(mesh.vertices) * frame["scale"] + frame["offset"]
+        mesh.vertices = open3d.utility.Vector3dVector(vertices)
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(open3d.t.geometry.TriangleMesh.from_legacy(mesh))
+    return scene
+
+
+def seen_on_mesh(mesh, points, centre):
+    """(n,) bool: is any of some points around each sample in sight from the centre (3,)?"""
+    seen = np.zeros(len(points), bool)
+    for offset in JITTER * np.concatenate([np.eye(3), -np.eye(3)]):
+        ways = points + offset - centre
+        rays = np.concatenate([np.broadcast_to(centre, ways.shape), ways], axis=1).astype(np.float32)
+        reached = mesh.cast_rays(rays)["t_hit"].numpy() * np.linalg.norm(ways, axis=1)
+        seen |= reached > np.linalg.norm(ways, axis=1) - HIDDEN
+    return seen
+
+
+def contour_pixels(mesh, lens, pose, shape):
+    """(n, 2) pixels at which the depth jumps: outlines and occluding contours."""
+    rows, columns = np.indices(shape)
+    towards = np.stack([columns, rows, np.ones(shape)], axis=-1) @ np.linalg.inv(lens).T @ pose[:, :3]
+    centre = np.broadcast_to(-pose[:, :3].T @ pose[:, 3], towards.shape)
+    depth = mesh.cast_rays(np.concatenate([centre, towards], axis=-1).astype(np.float32))["t_hit"].numpy()
+    depth = np.minimum(depth, 100.0)
+    low, high = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
+    return np.argwhere(high - low > STEP)[:, ::-1]
+
+
+def seen_on_map(path, pixels):
+    """(n,) bool: has a learned detector's map a ridge within FAR_PX of the pixels?"""
+    ridges = ridge_points(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), 0.8, 0.3)[0]
+    return cKDTree(ridges).query(pixels)[0] < FAR_PX
+
+
+def outline_sides(alpha, pixels, normals):
+    """(n,) of the normals: +1 where it points out of the object, -1 where into it, 0 where both sides are object."""
+    height, width = alpha.shape
+
+    def covered(offset):
+        places = np.rint(pixels + offset * normals).astype(int)
+        return alpha[places[:, 1].clip(0, height - 1), places[:, 0].clip(0, width - 1)] > 127
+
+    return covered(-2.5).astype(int) - covered(2.5)
+
+
+def measure_view(edgels, truth, image, mesh, lens, pose, map_path):
+    """Columns of one view: see `report`."""
+    points, tangents = truth
+    height, width = image.shape[:2]
+    alpha = image[:, :, 3] if image.shape[2] == 4 else np.full((height, width), 255, np.uint8)
+    pixels, _ = project(points, lens, pose)
+    ahead, _ = project(points + 1e-4 * tangents, lens, pose)
+    inside = inside_image(pixels, width, height)
+    centre = -pose[:, :3].T @ pose[:, 3]
+    seen = inside & (seen_on_mesh(mesh, points, centre) if mesh else True)
+    if not mesh:
+        seen[seen] = seen_on_map(map_path, pixels[seen])
+    pixels, along = pixels[seen], (ahead - pixels)[seen]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    normals = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    found, own_normals, _ = edgels
+    away = cKDTree(found).query(pixels)[0]
+    outlines = (
+        contour_pixels(mesh, lens, pose, (height, width))
+        if mesh
+        else np.argwhere(cv2.morphologyEx(alpha, cv2.MORPH_GRADIENT, np.ones((3, 3))) > 127)[:, ::-1]
+    )
+    to_truth, nearest = cKDTree(pixels).query(found)
+    lost = np.minimum(to_truth, cKDTree(outlines).query(found)[0]) > FAR_PX
+    good = (to_truth < 2.0) & (np.abs((own_normals * normals[nearest]).sum(axis=1)) > PARALLEL)
+    offsets = ((found - pixels[nearest]) * normals[nearest]).sum(axis=1)[good]
+    sides = outline_sides(alpha, pixels, normals)[nearest][good]
+    crease = outline_sides(alpha, pixels, normals) == 0
+    return dict(
+        away=away,
+        crease=crease,
+        lost=lost,
+        offsets=offsets,
+        normals=normals[nearest][good],
+        sides=sides,
+        own=own_normals[good],
+        length=len(found),
+    )
+
+
+def report(name, rows):
+    """One line of Markdown for a scene."""
+    column = {key: np.concatenate([np.atleast_1d(row[key]) for row in rows]) for key in rows[0]}
+    away, offsets, sides, normals = (column[key] for key in ("away", "offsets", "sides", "normals"))
+    good = np.abs(offsets) < 0.6
+    # The one shift (dx, dy) of all edgels that explains the offsets along the normals best.
+    shift = np.linalg.lstsq(normals[good], offsets[good], rcond=None)[0]
+    outward = np.median((offsets * sides)[(sides != 0) & good])
+    crease = column["crease"]
+    errors = np.abs(offsets)
+    angle = np.degrees(np.arccos(np.clip(np.abs((column["own"] * normals).sum(axis=1))[good], 0, 1)))
+    print(
+        f"| {name} | {np.median(errors):.3f} / {np.quantile(errors, 0.95):.2f} | {shift[0]:+.3f}, {shift[1]:+.3f} "
+        f"| {outward:+.3f} | {np.mean(away < NEAR_PX):.1%} / {np.mean(away < FAR_PX):.1%} "
+        f"| {np.mean(away[crease] < NEAR_PX):.1%} / {np.mean(away[crease] < FAR_PX):.1%} "
+        f"| {column['lost'].mean():.1%} | {np.median(angle):.1f} | {column['length'].mean():.0f} |",
+        flush=True,
+    )
+
+
+SCENES = {
+    "00004926": ("abc_nef_edge/00004926", read_emap, "color", "gt/curves.json", "edge_DexiNed"),
+    "00000006": ("abc_nef/00000006", read_nerf, "train_img", "gt/curves.json", "train"),
+    "plate": ("cad/plate", read_emap, "color", "gt_edges.json", None),
+}
+HEADER = """
+| scene | normal error px, median / 95 % | shift dx, dy | outward at outlines | recall 1 px / 3 px \
+| of creases alone | false | angle, degrees | edgels a view |
+|---|---|---|---|---|---|---|---|---|"""
+
+
+def measure(scene):
+    """Print the line of one scene; returns the seconds for the detection."""
+    place, reader, images, truth_path, maps = SCENES[scene]
+    folder = Path(os.environ["TAICHI_EDGES_DATA"]) / place
+    names, paths, lenses, poses = reader(folder, images)
+    truth, mesh = sharp_curves(folder / truth_path), read_mesh(folder)
+    paths = [str(path) if path.is_file() else "" for path in paths]
+    start = time.perf_counter()
+    edgels = trace_pictures(paths, threads=2)
+    seconds = time.perf_counter() - start
+    rows = []
+    for view, path in enumerate(paths):
+        if path:
+            image = cv2.imread(path, cv2.IMREAD_UNCHANGED)
+            map_path = folder / maps / names[view] if maps else None
+            rows.append(measure_view(edgels.of_view(view), truth, image, mesh, lenses[view], poses[view], map_path))
+    report(scene, rows)
+    return seconds
+
+
+if __name__ == "__main__":
+    print(HEADER.strip())
+    spent = {scene: measure(scene) for scene in sys.argv[1:] or SCENES}
+    print("\nSeconds for all views: " + ", ".join(f"{scene} {seconds:.1f}" for scene, seconds in spent.items()))
