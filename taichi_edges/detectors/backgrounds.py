@@ -66,17 +66,15 @@ class Sides:
         return weights
 
     def observations(self, views, shift=(0.0, 0.0)):
-        """Observations of the edgels against the images. views: (n,) int. None where there are none.
+        """Observations of the edgels of maps shifted by so many px against the images. views: (n,) int.
 
-        Silhouettes are held against the alpha channel's outline: in the colour beside it nothing has to be true.
+        Silhouettes are held against the outline in the alpha channel only: an image without one may show the object
+        as dilated as the detector saw it.
         """
-        silhouette = self.silhouettes(shift) >= CLEAR
-        outlines = silhouette & self.from_alpha
+        outlines = self.from_alpha & (self.silhouettes(shift) >= CLEAR)
         places = np.where(outlines, self.depths, self.steps)
-        chosen = np.flatnonzero((silhouette | self.interior) & np.isfinite(places))
-        if len(chosen) == 0:
-            return None
-        flags = silhouette[chosen].astype(np.float64)
+        chosen = np.flatnonzero((outlines | self.interior) & np.isfinite(places))
+        flags = outlines[chosen].astype(np.float64)
         return Observations(-places[chosen], self.outward[chosen], flags, chosen, views[chosen])
 
 
@@ -101,7 +99,7 @@ def look_beside(edge_map, image_path, points, normals, width_px):
     profiles = np.where(turned[:, None], profiles[:, ::-1], profiles)
     outside, inside = profiles[:, along >= first].mean(axis=1), profiles[:, along <= -first].mean(axis=1)
     contrast = smooth_step((outside - 0.5) / (CLEAR - 0.5)) * smooth_step((0.5 - inside) / (CLEAR - 0.5))
-    depths = np.where(contrast > 0, reach - profiles.mean(axis=1) * 2 * reach, np.nan)
+    depths = np.where(contrast > 0, reach + ALONG_STEP * (0.5 - profiles.sum(axis=1)), np.nan)
     away = cv2.distanceTransform((background < 0.5).astype(np.uint8), cv2.DIST_L2, 5)
     interior = sample(away, points, normals, np.zeros(1))[:, 0] > first + INTERIOR
     steps = np.full(len(points), np.nan) if grey is None else image_steps(grey, points, outward)

@@ -13,6 +13,7 @@ REACH = 8.0  # px to each side of a point's projection that are searched
 STEP = 0.5  # px between the pixels looked at
 SAME_LINE = 2.5  # px; edgels farther apart across the edge are of two lines
 ALIGNED = np.cos(np.radians(20.0))  # an edgel runs along the projection of its point's line, to that angle
+BESIDE = (-2, -1, 0, 1, 2)  # px along an edge, to which an edgel's point explains others too
 LEAST_LENGTH = 0.2  # of a line's true length: seen more end-on, its direction says nothing
 
 
@@ -56,6 +57,41 @@ def observe(views, edgels, corrected, outward, silhouette, points, directions, r
         return Observations(*(np.concatenate(column) for column in columns))
 
 
+def residuals_beside(views, edgels, outward, points, directions, reach, threads=None):
+    """(n,) px from the nearest 3D point's line to each edgel along `outward`; NaN for edgels that no point explains.
+
+    A point explains the edgel that is its own and those next to it along the line.
+    """
+
+    def look(view):
+        places, normals, _ = edgels.of_view(view)
+        residuals = np.full(len(places), np.nan)
+        owners, found = _edgels_beside(views, view, edgels, points, directions, reach)
+        if len(found) == 0:
+            return residuals
+        pixels, _ = views.project(points[owners], view)
+        table = edgel_table(places, (views.height, views.width))
+        tangents = np.stack([-normals[found, 1], normals[found, 0]], axis=1)
+        pairs = []
+        for along in BESIDE:
+            columns, rows = np.rint(places[found] + along * tangents).astype(np.int64).T + 1
+            columns, rows = np.clip(columns, 0, views.width + 1), np.clip(rows, 0, views.height + 1)
+            others = table[rows, columns]
+            same = np.abs((normals[others] * normals[found]).sum(axis=1)) >= ALIGNED
+            offsets = ((places[others] - pixels) * normals[found]).sum(axis=1)
+            good = (others >= 0) & same & (np.abs(offsets) <= reach)
+            pairs.append((others[good], offsets[good], normals[found][good]))
+        others, offsets, across_ = (np.concatenate(column) for column in zip(*pairs))
+        order = np.argsort(-np.abs(offsets), kind="stable")  # the smallest comes last, and stays
+        others, offsets, across_ = others[order], offsets[order], across_[order]
+        own = outward[edgels.starts[view] : edgels.starts[view + 1]][others]
+        residuals[others] = offsets * np.sign((across_ * own).sum(axis=1))
+        return residuals
+
+    with ThreadPoolExecutor(threads) as pool:
+        return np.concatenate(list(pool.map(look, range(len(views)))))
+
+
 def displaced(views, points, directions, displacements):
     """The (n, 3) points, moved across their directions by (n, 2) px at the middle of the scene box."""
     return points + pixel_size(views) * np.einsum("nk,nkj->nj", displacements, across(directions))
@@ -87,7 +123,7 @@ def _edgels_beside(views, view, edgels, points, directions, reach):
     steps = np.clip(steps, 0, [shape[1] + 1, shape[0] + 1])
     found = table[steps[:, :, 1], steps[:, :, 0]]  # (n, k) edgels
     there = found >= 0
-    offsets = np.where(there, ((places[found] - pixels[:, None]) * across_[:, None]).sum(axis=2), np.inf)
+    offsets = np.where(there, ((places[found] - pixels[:, None]) * across_[:, None]).sum(axis=2), 0.0)
     aligned = there & (np.abs((normals[found] * across_[:, None]).sum(axis=2)) >= ALIGNED)
     distances = np.where(aligned, np.abs(offsets), np.inf)
     rows, best = np.arange(len(seen)), distances.argmin(axis=1)

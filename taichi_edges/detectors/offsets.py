@@ -6,9 +6,12 @@ import numpy as np
 
 NOTHING_KNOWN = 100.0  # px; prior standard deviation of an offset: one that nothing observes keeps it as its error
 FREE_WAY = 10.0  # px; prior standard deviation of a point's displacement, far beyond what seeds are off
-ABSOLUTE_ROUNDS, REDESCENDING_ROUNDS = 5, 10  # first least absolute values, from anywhere; then outliers drop out
+ABSOLUTE_ROUNDS, REDESCENDING_ROUNDS = 4, 8  # first least absolute values, from anywhere; then outliers drop out
 LEAST_RESIDUAL = 0.1  # px; below, a residual is as good as none
 CUT = 2.0  # standard deviations of the residuals at which the Geman-McClure weight has fallen to a quarter
+# A point that is mostly on silhouettes would explain their offset, which is not quite the same all round, by moving;
+# interior edgels, which have none, shall say where it is.
+INTERIOR_WEIGHT = 3.0
 NORMAL_MAD = 1.4826  # standard deviations for each median absolute deviation, of a normal distribution
 VIEW_BLOCKS, SPLITS = 10, 4  # views next to each other, and halves of halves of the points, that are left out together
 
@@ -20,7 +23,7 @@ class Observations:
     offsets:    (m,) px, from the reference to the edgel along `normals`.
     normals:    (m, 2) unit vectors across the edge, of silhouettes outward.
     silhouette: (m,) float, 1 on silhouettes and 0 inside.
-    edgels:     (m,) which edgel. views: (m,) in which view.
+    edgels:     (m,) which edgel. views: (m,) in which view it is.
     owners:     (m,) which 3D point is the reference; None where the reference is exact.
     slopes:     (m, 2) px that the reference moves along the normal for each px of displacement of its point.
     """
@@ -33,6 +36,14 @@ class Observations:
     owners: np.ndarray | None = None
     slopes: np.ndarray | None = None
 
+    def __len__(self):
+        return len(self.offsets)
+
+    def keep(self, chosen):
+        """Only the chosen observations. chosen: (m,) bool."""
+        arrays = (getattr(self, name) for name in Observations.__annotations__)
+        return Observations(*(None if array is None else array[chosen] for array in arrays))
+
     @property
     def columns(self):
         """(m, 3): what each observation sees of the outward offset and of the shift's two coordinates."""
@@ -41,36 +52,51 @@ class Observations:
 
 @dataclass(frozen=True)
 class Fit:
-    """values, errors: (3,) px: outward offset of silhouettes, shift in x and y. residuals: (m,) px, offset - model.
+    """What fits m observations best.
 
-    displacements: (n, 2) of the points, px; None where there are none.
+    values:        (3,) px: outward offset of silhouettes, shift in x and y.
+    displacements: (n, 2) px, of the points; None where there are none.
+    residuals:     (m,) px, offset - model. weights: (m,) of the observations in the end.
+    matrix:        (3, 3) of the values' normal equations.
     """
 
     values: np.ndarray
-    errors: np.ndarray
-    residuals: np.ndarray
     displacements: np.ndarray | None
+    residuals: np.ndarray
+    weights: np.ndarray
+    matrix: np.ndarray
 
 
-def fit_offsets(observations, known, points=None):
+def fit_offsets(observations, known, count=None):
     """Fit of the observations. known: (3,) px values that are taken as they are, NaN where they are fitted.
 
-    points: (n, 3) unit cube, the owners; their displacements are fitted too.
+    count: number of 3D points, the owners, where there are any; their displacements are fitted too.
+    """
+    weights = np.where(observations.silhouette > 0, 1.0, INTERIOR_WEIGHT)
+    residuals = observations.offsets - np.median(observations.offsets)
+    robust = _weights(residuals, redescending=False)
+    for round_ in range(1, ABSOLUTE_ROUNDS + REDESCENDING_ROUNDS + 1):
+        values, displacements, matrix = _solve(observations, weights * robust, known, count)
+        residuals = _residuals(observations, values, displacements)
+        robust = _weights(residuals, redescending=round_ >= ABSOLUTE_ROUNDS)
+    return Fit(values, displacements, residuals, weights * robust, matrix)
+
+
+def standard_errors(observations, fit, known, points=None):
+    """(3,) px: standard errors of a fit's values, 0 where they are known. points: (n, 3) unit cube, the owners.
+
+    Observations in one view, and those of points near each other, err alike; a plain standard error would count them
+    as independent. So the values' spread is measured when blocks of views, and of points, are left out; the variances
+    are added, which rather overestimates.
     """
     count = None if points is None else len(points)
-    residuals, values = observations.offsets - np.median(observations.offsets), np.zeros(3)
-    weights = np.ones(len(residuals))
-    for round_ in range(ABSOLUTE_ROUNDS + REDESCENDING_ROUNDS):
-        values, displacements, _ = _solve(observations, weights, known, count)
-        residuals = _residuals(observations, values, displacements)
-        weights = _weights(residuals, redescending=round_ >= ABSOLUTE_ROUNDS - 1)
-    values, displacements, normal_matrix = _solve(observations, weights, known, count)
-    residuals = _residuals(observations, values, displacements)
-    noise = np.average(residuals**2, weights=weights)
-    variances = noise * np.diag(np.linalg.inv(normal_matrix)) + _spread_between_blocks(
-        observations, weights, known, points
-    )
-    return Fit(values, np.where(np.isnan(known), np.sqrt(variances), 0.0), residuals, displacements)
+    variances = np.average(fit.residuals**2, weights=fit.weights) * np.diag(np.linalg.inv(fit.matrix))
+    views = np.unique(observations.views, return_inverse=True)[1]
+    variances += _jackknife(observations, fit.weights, known, count, views * VIEW_BLOCKS // (views.max() + 1))
+    if points is not None:
+        blocks = neighbourhoods(points)[observations.owners]
+        variances += _jackknife(observations, fit.weights, known, count, blocks)
+    return np.where(np.isnan(known), np.sqrt(variances), 0.0)
 
 
 def _weights(residuals, redescending):
@@ -125,20 +151,6 @@ def _point_equations(observations, weights, weighted, targets, count):
     crossed = np.array([[sums(slopes[:, i] * weighted[:, j]) for j in range(3)] for i in range(2)])
     sides = np.array([sums(slopes[:, i] * weights * targets) for i in range(2)])
     return np.moveaxis(inverses, 2, 0), np.moveaxis(crossed, 2, 0), sides.T
-
-
-def _spread_between_blocks(observations, weights, known, points):
-    """(3,) px^2: variances of the values, from how they change when a block of views, or of points, is left out.
-
-    Observations in one view, and those of points near each other, err alike; a plain standard error would count them
-    as independent. The two variances are added, which rather overestimates.
-    """
-    count = None if points is None else len(points)
-    views = np.unique(observations.views, return_inverse=True)[1]
-    groups = [views * VIEW_BLOCKS // (views.max() + 1)]
-    if points is not None:
-        groups.append(neighbourhoods(points)[observations.owners])
-    return sum(_jackknife(observations, weights, known, count, group) for group in groups)
 
 
 def _jackknife(observations, weights, known, count, groups):
