@@ -4,13 +4,13 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from taichi_edges.cameras import NEAR
+from taichi_edges.cameras import NEAR, inside_image
 from taichi_edges.detectors.offsets import Observations
 from taichi_edges.support import pixel_size
 
 MOST_POINTS = 3000  # more would only cost time: each is seen by most of the views
 REACH = 8.0  # px to each side of a point's projection that are searched
-STEP = 0.5  # px between the pixels looked at
+STEP = 1.0  # px between the pixels looked at; a line in the table is two wide or more
 SAME_LINE = 2.5  # px; edgels farther apart across the edge are of two lines
 ALIGNED = np.cos(np.radians(20.0))  # an edgel runs along the projection of its point's line, to that angle
 BESIDE = (-2, -1, 0, 1, 2)  # px along an edge, to which an edgel's point explains others too
@@ -108,28 +108,37 @@ def _derivatives(views, view, points):
 
 
 def _edgels_beside(views, view, edgels, points, directions, reach):
-    """Points (m,) and, for each, the edgel (m,) of the view nearest to its projection across the edge."""
-    shape = (views.height, views.width)
+    """Points (m,) and, for each, the edgel (m,) of the view nearest to its projection across the edge, at most `reach`
+    px away; only where no other edge is near.
+    """
     places, normals, _ = edgels.of_view(view)
     pixels, across_ = _projected_normals(views, view, points, directions)
-    inside = np.isfinite(pixels).all(axis=1) & np.isfinite(across_).all(axis=1)
-    seen = np.flatnonzero(inside & (pixels > -0.5).all(axis=1) & (pixels < [shape[1] - 0.5, shape[0] - 0.5]).all(axis=1))
-    if len(places) == 0 or len(seen) == 0:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    seen = np.flatnonzero(inside_image(pixels, views.width, views.height) & np.isfinite(across_[:, 0]))
     pixels, across_ = pixels[seen], across_[seen]
-    along = np.arange(-REACH, REACH + STEP / 2, STEP)
-    table = edgel_table(places, shape)
-    steps = np.rint(pixels[:, None] + along[:, None] * across_[:, None]).astype(np.int64) + 1
-    steps = np.clip(steps, 0, [shape[1] + 1, shape[0] + 1])
-    found = table[steps[:, :, 1], steps[:, :, 0]]  # (n, k) edgels
-    there = found >= 0
-    offsets = np.where(there, ((places[found] - pixels[:, None]) * across_[:, None]).sum(axis=2), 0.0)
-    aligned = there & (np.abs((normals[found] * across_[:, None]).sum(axis=2)) >= ALIGNED)
-    distances = np.where(aligned, np.abs(offsets), np.inf)
-    rows, best = np.arange(len(seen)), distances.argmin(axis=1)
-    alone = ~(there & (np.abs(offsets - offsets[rows, best][:, None]) > SAME_LINE)).any(axis=1)
-    good = alone & (distances[rows, best] <= reach)
-    return seen[good], found[rows, best][good].astype(np.int64)
+    rows, found = _walk(edgel_table(places, (views.height, views.width)), pixels, across_)
+    offsets = ((places[found] - pixels[rows]) * across_[rows]).sum(axis=1)
+    aligned = np.abs((normals[found] * across_[rows]).sum(axis=1)) >= ALIGNED
+    order = np.lexsort((np.where(aligned, np.abs(offsets), np.inf), rows))
+    nearest = order[np.unique(rows[order], return_index=True)[1]]  # of each row that has any
+    best = np.zeros(len(seen))
+    best[rows[nearest]] = offsets[nearest]
+    others = np.bincount(rows, np.abs(offsets - best[rows]) > SAME_LINE, len(seen))
+    nearest = nearest[aligned[nearest] & (np.abs(offsets[nearest]) <= reach) & (others[rows[nearest]] == 0)]
+    return seen[rows[nearest]], found[nearest].astype(np.int64)
+
+
+def _walk(table, pixels, directions):
+    """The edgels met on walks through pixels (n, 2) along directions (n, 2): which walk (k,), and which edgel (k,)."""
+    along = np.arange(-REACH, REACH + STEP / 2, STEP, dtype=np.float32)
+    columns, rows = (
+        np.rint(pixels[:, axis, None] + 1 + directions[:, axis, None].astype(np.float32) * along).astype(np.int32)
+        for axis in (0, 1)
+    )
+    np.clip(columns, 0, table.shape[1] - 1, out=columns)
+    np.clip(rows, 0, table.shape[0] - 1, out=rows)
+    found = table.reshape(-1)[rows * table.shape[1] + columns]
+    walks, steps = np.nonzero(found >= 0)
+    return walks, found[walks, steps]
 
 
 def _projected_normals(views, view, points, directions):

@@ -72,7 +72,7 @@ def fit_offsets(observations, known, count=None):
 
     count: number of 3D points, the owners, where there are any; their displacements are fitted too.
     """
-    weights = np.where(observations.silhouette > 0, 1.0, INTERIOR_WEIGHT)
+    weights = np.where((observations.silhouette > 0) | (count is None), 1.0, INTERIOR_WEIGHT)
     residuals = observations.offsets - np.median(observations.offsets)
     robust = _weights(residuals, redescending=False)
     for round_ in range(1, ABSOLUTE_ROUNDS + REDESCENDING_ROUNDS + 1):
