@@ -24,6 +24,7 @@ INTERIOR = 8.0  # px; edgels without background that near, beyond the line's own
 STEP_REACH = 4.0  # px to each side in which an image's edge is looked for
 STEP_SIGMA = 1.0  # px; smoothing of the image before its gradient is taken
 LEAST_STEP = 1.5  # grey levels per px: weaker gradients are noise
+MOST_OBSERVATIONS = 150_000  # more, evenly spread over the views, would tell no more
 ALONE = 0.5  # other gradients across the edgel are lower than this share of the highest
 
 
@@ -74,6 +75,7 @@ class Sides:
         outlines = self.from_alpha & (self.silhouettes(shift) >= CLEAR)
         places = np.where(outlines, self.depths, self.steps)
         chosen = np.flatnonzero((outlines | self.interior) & np.isfinite(places))
+        chosen = chosen[:: len(chosen) // MOST_OBSERVATIONS + 1]
         flags = outlines[chosen].astype(np.float64)
         return Observations(-places[chosen], self.outward[chosen], flags, chosen, views[chosen])
 

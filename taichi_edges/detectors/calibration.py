@@ -22,10 +22,10 @@ SURE, WORTH_PX = 3.0, 0.1  # a bias is corrected from so many standard errors an
 REACHES = (5.0, 3.0)  # px around a 3D point within which an edgel may be its, round by round
 FARTHEST_PX = 3.0  # that a point is moved in one round
 MOST_SILHOUETTE = 0.85  # of a point's observations; with more it cannot tell its own displacement from their offset
-# px: standard errors, of the outward offset and the shift's coordinates, that no leaving out of observations shows.
-# Interior edges have small biases of their own, which points on them take over: PiDiNet's and DexiNed's on exact CAD
-# models some 0.15 px, hence the offset came out wrong by up to 0.12 px and the shift by 0.09.
-POINT_ERRORS = np.array([0.1, 0.05, 0.05])
+# Standard errors through 3D points, of the outward offset and the shift's coordinates, for each px of median residual,
+# that no leaving out of observations shows: interior edges have small biases of their own, which points on them take
+# over. On exact CAD models, with residuals of 0.17 px, the offset came out wrong by 0.12 px and the shift by 0.09.
+POINT_ERRORS = np.array([0.6, 0.4, 0.4])
 EDGE_LEVEL = 0.5  # of full scale, at which the width of the maps' lines is measured
 
 
@@ -208,7 +208,8 @@ class _Seeds:
             return None
         fit = fit_offsets(observations, known, len(self.points))
         errors = standard_errors(observations, fit, known, self.points)
-        return _Estimate(fit.values, np.hypot(errors, POINT_ERRORS), "points")
+        own = POINT_ERRORS * np.median(np.abs(fit.residuals)) * np.isnan(known)
+        return _Estimate(fit.values, np.hypot(errors, own), "points")
 
     def residuals(self, values):
         """(n,) px residuals of the edgels corrected by `values`, (3,) px; the points are moved to fit those first."""
