@@ -1,0 +1,173 @@
+"""Constant offsets of a detector's edgels, fitted to many observations robustly, with errors that can be believed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+NOTHING_KNOWN = 100.0  # px; prior standard deviation of an offset: one that nothing observes keeps it as its error
+FREE_WAY = 10.0  # px; prior standard deviation of a point's displacement, far beyond what seeds are off
+ABSOLUTE_ROUNDS, REDESCENDING_ROUNDS = 4, 8  # first least absolute values, from anywhere; then outliers drop out
+LEAST_RESIDUAL = 0.1  # px; below, a residual is as good as none
+CUT = 2.0  # standard deviations of the residuals at which the Geman-McClure weight has fallen to a quarter
+# A point that is mostly on silhouettes would explain their offset, which is not quite the same all round, by moving;
+# interior edgels, which have none, shall say where it is.
+INTERIOR_WEIGHT = 3.0
+NORMAL_MAD = 1.4826  # standard deviations for each median absolute deviation, of a normal distribution
+VIEW_BLOCKS, SPLITS = 10, 4  # views next to each other, and halves of halves of the points, that are left out together
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Edgels against where the edge should be: offset = b * silhouette + normal . shift + slope . displacement.
+
+    offsets:    (m,) px, from the reference to the edgel along `normals`.
+    normals:    (m, 2) unit vectors across the edge, of silhouettes outward.
+    silhouette: (m,) float, 1 on silhouettes and 0 inside.
+    edgels:     (m,) which edgel. views: (m,) in which view it is.
+    owners:     (m,) which 3D point is the reference; None where the reference is exact.
+    slopes:     (m, 2) px that the reference moves along the normal for each px of displacement of its point.
+    """
+
+    offsets: np.ndarray
+    normals: np.ndarray
+    silhouette: np.ndarray
+    edgels: np.ndarray
+    views: np.ndarray
+    owners: np.ndarray | None = None
+    slopes: np.ndarray | None = None
+
+    def __len__(self):
+        return len(self.offsets)
+
+    def keep(self, chosen):
+        """Only the chosen observations. chosen: (m,) bool."""
+        arrays = (getattr(self, name) for name in Observations.__annotations__)
+        return Observations(*(None if array is None else array[chosen] for array in arrays))
+
+    @property
+    def columns(self):
+        """(m, 3): what each observation sees of the outward offset and of the shift's two coordinates."""
+        return np.column_stack([self.silhouette, self.normals])
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What fits m observations best.
+
+    values:        (3,) px: outward offset of silhouettes, shift in x and y.
+    displacements: (n, 2) px, of the points; None where there are none.
+    residuals:     (m,) px, offset - model. weights: (m,) of the observations in the end.
+    matrix:        (3, 3) of the values' normal equations.
+    """
+
+    values: np.ndarray
+    displacements: np.ndarray | None
+    residuals: np.ndarray
+    weights: np.ndarray
+    matrix: np.ndarray
+
+
+def fit_offsets(observations, known, count=None):
+    """Fit of the observations. known: (3,) px values that are taken as they are, NaN where they are fitted.
+
+    count: number of 3D points, the owners, where there are any; their displacements are fitted too.
+    """
+    weights = np.where((observations.silhouette > 0) | (count is None), 1.0, INTERIOR_WEIGHT)
+    residuals = observations.offsets - np.median(observations.offsets)
+    robust = _weights(residuals, redescending=False)
+    for round_ in range(1, ABSOLUTE_ROUNDS + REDESCENDING_ROUNDS + 1):
+        values, displacements, matrix = _solve(observations, weights * robust, known, count)
+        residuals = _residuals(observations, values, displacements)
+        robust = _weights(residuals, redescending=round_ >= ABSOLUTE_ROUNDS)
+    return Fit(values, displacements, residuals, weights * robust, matrix)
+
+
+def standard_errors(observations, fit, known, points=None):
+    """(3,) px: standard errors of a fit's values, 0 where they are known. points: (n, 3) unit cube, the owners.
+
+    Observations in one view, and those of points near each other, err alike; a plain standard error would count them
+    as independent. So the values' spread is measured when blocks of views, and of points, are left out; the variances
+    are added, which rather overestimates.
+    """
+    count = None if points is None else len(points)
+    variances = np.average(fit.residuals**2, weights=fit.weights) * np.diag(np.linalg.inv(fit.matrix))
+    views = np.unique(observations.views, return_inverse=True)[1]
+    variances += _jackknife(observations, fit.weights, known, count, views * VIEW_BLOCKS // (views.max() + 1))
+    if points is not None:
+        blocks = neighbourhoods(points)[observations.owners]
+        variances += _jackknife(observations, fit.weights, known, count, blocks)
+    return np.where(np.isnan(known), np.sqrt(variances), 0.0)
+
+
+def _weights(residuals, redescending):
+    """(m,) IRLS weights: of least absolute values, or Geman and McClure's at the residuals' own scale."""
+    sizes = np.abs(residuals)
+    if not redescending:
+        return LEAST_RESIDUAL / np.maximum(sizes, LEAST_RESIDUAL)
+    scale = CUT * max(NORMAL_MAD * np.median(sizes), LEAST_RESIDUAL)
+    return 1.0 / (1.0 + (residuals / scale) ** 2) ** 2
+
+
+def _residuals(observations, values, displacements):
+    residuals = observations.offsets - observations.columns @ values
+    if displacements is None:
+        return residuals
+    return residuals - (observations.slopes * displacements[observations.owners]).sum(axis=1)
+
+
+def _solve(observations, weights, known, count):
+    """Weighted least squares: values (3,), displacements (count, 2), and the matrix of the values' normal equations.
+
+    The points are eliminated first, each by itself (Schur complement).
+    """
+    columns, free = observations.columns, np.isnan(known)
+    targets = observations.offsets - columns @ np.where(free, 0.0, known)
+    columns = columns * free
+    weighted = columns * weights[:, None]
+    matrix = weighted.T @ columns + np.eye(3) / NOTHING_KNOWN**2
+    right = weighted.T @ targets
+    displacements = None
+    if count is not None:
+        inverses, crossed, sides = _point_equations(observations, weights, weighted, targets, count)
+        eliminated = inverses @ crossed
+        matrix -= np.einsum("nki,nkj->ij", crossed, eliminated)
+        right -= np.einsum("nki,nk->i", eliminated, sides)
+    values = np.linalg.solve(matrix, right)
+    if count is not None:
+        displacements = np.einsum("nij,nj->ni", inverses, sides - crossed @ values)
+    return np.where(free, values, known), displacements, matrix
+
+
+def _point_equations(observations, weights, weighted, targets, count):
+    """Of each point: inverse of its (2, 2) normal matrix, its coupling (2, 3) to the values, its right side (2,)."""
+    slopes, owners = observations.slopes, observations.owners
+
+    def sums(terms):
+        return np.bincount(owners, terms, count)
+
+    xx, xy, yy = (sums(weights * slopes[:, i] * slopes[:, j]) for i, j in ((0, 0), (0, 1), (1, 1)))
+    xx, yy = xx + FREE_WAY**-2, yy + FREE_WAY**-2
+    inverses = np.array([[yy, -xy], [-xy, xx]]) / (xx * yy - xy**2)
+    crossed = np.array([[sums(slopes[:, i] * weighted[:, j]) for j in range(3)] for i in range(2)])
+    sides = np.array([sums(slopes[:, i] * weights * targets) for i in range(2)])
+    return np.moveaxis(inverses, 2, 0), np.moveaxis(crossed, 2, 0), sides.T
+
+
+def _jackknife(observations, weights, known, count, groups):
+    """(3,) px^2: delete-a-group jackknife variances. groups: (m,) int."""
+    labels = np.unique(groups)
+    if len(labels) < 2:
+        return np.full(3, NOTHING_KNOWN**2)
+    found = np.array([_solve(observations, weights * (groups != label), known, count)[0] for label in labels])
+    return (len(labels) - 1) * found.var(axis=0)
+
+
+def neighbourhoods(points):
+    """(n,) int: blocks of equally many (n, 3) points near each other: SPLITS times each is halved at its median."""
+    labels = np.zeros(len(points), np.int64)
+    for split in range(SPLITS):
+        values = points[:, split % 3]
+        for label in range(2**split):
+            part = np.flatnonzero(labels == label)
+            labels[part[np.argsort(values[part], kind="stable")[len(part) // 2 :]]] += 2**split
+    return labels
