@@ -14,6 +14,7 @@ NEAR_PX = 3.0  # an edgel within this distance, and nobody else's, should lie on
 BESIDE_PX, ALONG_PX = 2.0, 8.0  # a point so near to the owner, across and along its direction, is on the same edge
 TIGHT_PX, TIGHT_NOISES = 0.25, 2.0  # residuals of an edge: within the first, or within so many times the maps' noise
 BEST_SUPPORTED = 0.2  # share of the points whose residuals tell the noise; those of stray points and contours do not
+LEAST_USUAL = 0.3  # steadiness; where the best points have less, there is nothing to compare with
 NOISE_PER_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute value
 VIEWS_AT_ONCE = 16
 
@@ -23,7 +24,8 @@ class Explained:
     """What edgels say about points when each of them counts for one edge alone.
 
     support: (n,) share of the views that have a point in the image in which it lies on an edgel of its own edge.
-    steadiness: (n,) of the edgels near a point's projections that no other edge explains, the share that lies on them.
+    steadiness: (n,) of the edgels near a point's projections that no other edge explains, the share that lies on them;
+    relative to that of the best-supported points, which is below 1 as much as the edgels are noisy.
     noise_px: standard deviation across the edge of the edgels of the best-supported points.
     """
 
@@ -46,8 +48,11 @@ def explain(matching, refined):
             shared += (_whose(matching, refined, owners, some, matches) > 0).sum(axis=1)
             seen += inside.sum(axis=1)
         owned = shared / np.maximum(seen, 1)
-    noise = _noise(matching, refined, owned)
-    return Explained(owned, _steadiness(matching, refined, owners, max(TIGHT_PX, TIGHT_NOISES * noise)), noise)
+    best = owned >= np.quantile(owned, 1 - BEST_SUPPORTED) if count else np.zeros(0, bool)
+    noise = _noise(matching, refined.keep(best))
+    steadiness = _steadiness(matching, refined, owners, max(TIGHT_PX, TIGHT_NOISES * noise))
+    usual = max(float(np.median(steadiness[best])), LEAST_USUAL) if count else 1.0
+    return Explained(owned, steadiness / usual, noise)
 
 
 def unexplained(matching, refined):
@@ -90,18 +95,15 @@ def _whose(matching, refined, owners, some, matches):
     return whose
 
 
-def _noise(matching, refined, owned):
-    """Standard deviation, px, of the residuals of the best-supported points."""
-    if len(refined) == 0:
-        return 0.0
-    best = refined.keep(owned >= np.quantile(owned, 1 - BEST_SUPPORTED))
+def _noise(matching, best):
+    """Standard deviation, px, of the residuals of the `best` points."""
     residuals = [found[matches >= 0] for _, matches, found, _ in _in_parts(matching, best, MATCH_PX)]
-    residuals = np.concatenate(residuals)
+    residuals = np.concatenate([np.zeros(0), *residuals])
     return float(NOISE_PER_MEDIAN * np.median(np.abs(residuals))) if len(residuals) else 0.0
 
 
 def _steadiness(matching, refined, owners, tight):
-    """(n,) see Explained. tight: px."""
+    """(n,) see Explained, not yet relative. tight: px."""
     on, near = np.zeros(len(refined)), np.zeros(len(refined))
     for some, matches, residuals, _ in _in_parts(matching, refined, NEAR_PX):
         counted = (matches >= 0) & (_whose(matching, refined, owners, some, matches) >= 0)

@@ -162,7 +162,7 @@ class FilterConfig(Section):
     min_support: Share = Field(0.05, description="share of the views that see a point and have an edge pixel there")
     refine: bool = Field(True, description="move points to where the viewing planes of their edgels meet")
     min_steadiness: Share = Field(
-        0.55, description="refine: of the edgels near a point that nothing else explains, the share that lie on it"
+        0.72, description="refine: share of the unexplained edgels near an edge that lie on it, relative to sure edges"
     )
     harvest: bool = Field(True, description="refine: look once more for edges seen in few views")
     grow: Share = Field(0.2, description="refine: continue edges where this share of the views agrees; 0: do not")

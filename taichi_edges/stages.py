@@ -231,7 +231,7 @@ def cluster(run):
     """`gaussians.ply`, `views.npz` -> `points.ply` (filtered oriented points, input frame) and `clusters.npz`."""
     from taichi_edges.edges.branches import separate_branches
     from taichi_edges.edges.clustering import grow_clusters
-    from taichi_edges.edges.filtering import filter_points
+    from taichi_edges.edges.filtering import drop_contours, filter_points
     from taichi_edges.edges.segmentation import split_clusters
     from taichi_edges.exporters.point_cloud import write_oriented_points
     from taichi_edges.exporters.splats import read_gaussians
@@ -244,7 +244,7 @@ def cluster(run):
     gaussians = Gaussians(*read_gaussians(run.path("gaussians.ply")))
     means = views.similarity.to_unit(gaussians.means.astype(np.float64))
     threshold, generator = run.config.train.edge_threshold, np.random.default_rng(run.config.seed)
-    points, directions, counts = filter_points(
+    points, directions, steadiness, counts = filter_points(
         means, gaussians.directions(), gaussians.opacities, views, run.config.filter, threshold, generator
     )
     if len(points) == 0:
@@ -254,11 +254,12 @@ def cluster(run):
     labels = grow_clusters(points, directions, run.config.cluster)
     labels = separate_branches(points, labels, run.config.cluster.min_points)
     labels = split_clusters(points, labels, run.config.cluster.min_points)
+    labels, contours = drop_contours(labels, steadiness, run.config.filter.min_steadiness)
     write_oriented_points(run.path("points.ply"), views.similarity.to_input(points), directions, labels)
     with replacing(run.path("clusters.npz")) as unfinished, open(unfinished, "wb") as file:
         np.savez_compressed(file, points=points, directions=directions, labels=labels)
     found = {"points": len(points), "clusters": int(labels.max() + 1), "unclustered": int((labels < 0).sum())}
-    return {**asdict(counts), **found}
+    return {**asdict(counts), **found, "contours": contours}
 
 
 def _in_words(counts):

@@ -20,7 +20,8 @@ class RefinedPoints:
     """Oriented points and what supports them.
 
     points, directions: (n, 3) unit cube, unit vectors. views: (n,) number of views in which an edgel lies on the point,
-    each counted by how closely. support: (n,) share of the views that have the point in the image.
+    each counted by how closely, and by the edgel's strength. support: (n,) `views` as a share of those that have the
+    point in the image.
     """
 
     points: np.ndarray

@@ -100,7 +100,7 @@ class Maxima:
 
 
 def trace_pictures(paths, threads=None, report=None, exponent=None):
-    """Edgels of images, a few of which are held at a time.
+    """Edgels of images, a few of which are held at a time, and the (width, height) of each, px, None without one.
 
     paths: (V,) image files, '' for a view without one, which has no edgels. threads: None for one per core; the
     result does not depend on it. report: called with the number of views that are done. exponent: see `as_picture`.
@@ -108,18 +108,23 @@ def trace_pictures(paths, threads=None, report=None, exponent=None):
     """
 
     def trace(path):
-        return detect_edgels(read_picture(path, exponent)) if path else _arrays([])
+        if not path:
+            return _arrays([]), None
+        picture = read_picture(path, exponent)
+        height, width = picture.light.shape[:2]
+        return detect_edgels(picture), (width, height)
 
-    views = []
+    views, sizes = [], []
     pool = ThreadPoolExecutor(threads or os.cpu_count())  # OpenCV and NumPy release the lock in the long loops
     try:
-        for view in pool.map(trace, paths):
+        for view, size in pool.map(trace, paths):
             views.append(view)
+            sizes.append(size)
             if report:
                 report(len(views))
     finally:
         pool.shutdown(cancel_futures=True)  # of no use any more when one image cannot be read
-    return Edgels.of_views(views)
+    return Edgels.of_views(views), sizes
 
 
 def detect_edgels(image):

@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 from taichi_edges.support import exclusive_support
 
 AROUND = 9  # points, itself included, over which the steadiness of a point is a median
-LEAST_VIEWS = 3.0  # of an edge seen in few views; two planes always meet
+LEAST_VIEWS = 2.5  # of full strength; two planes always meet, and a third one is there by chance too easily
+LENIENT = 0.75  # of the least steadiness, for a point
 HARVEST_KEEP = 0.06  # share of the views that must see one of the edges left over
 
 
@@ -35,15 +36,17 @@ def filter_points(means, directions, opacities, views, config, edge_threshold, g
 
     means: (n, 3) unit cube. directions: (n, 3) unit vectors. opacities: (n,). config: the scene's `filter` section.
     generator: numpy.random.Generator, for what is left to chance in the harvest. ti.init must have been called.
-    Returns points (m, 3) float64, directions (m, 3) float64 and FilterCounts.
+    Returns points (m, 3) float64, directions (m, 3) float64, steadiness (m,), and FilterCounts.
     """
     opaque = np.asarray(opacities) >= config.min_opacity
     points, directions = (np.asarray(array, dtype=np.float64)[opaque] for array in (means, directions))
     if config.refine:
-        points, directions, counts = refined_points(points, directions, views, config, edge_threshold, generator)
+        found = refined_points(points, directions, views, config, edge_threshold, generator)
+        points, directions, steadiness, counts = found
     else:
         on_edges = _on_edge_pixels(points, views, config.min_support, edge_threshold)
         points, directions, counts = points[on_edges], directions[on_edges], {"low_support": int((~on_edges).sum())}
+        steadiness = np.ones(len(points))
     inliers = statistical_inliers(points, config.outlier_neighbors, config.outlier_deviations)
     counts = FilterCounts(
         gaussians=len(opaque),
@@ -51,7 +54,7 @@ def filter_points(means, directions, opacities, views, config, edge_threshold, g
         **counts,
         outliers=len(points) - len(inliers),
     )
-    return points[inliers], directions[inliers], counts
+    return points[inliers], directions[inliers], steadiness[inliers], counts
 
 
 def _on_edge_pixels(points, views, least, edge_threshold):
@@ -67,7 +70,7 @@ def _on_edge_pixels(points, views, least, edge_threshold):
 def refined_points(points, directions, views, config, edge_threshold, generator):
     """Points on the edges that the edgels of the views agree on. Arguments as for `filter_points`.
 
-    Returns points, directions and the counts of FilterCounts that this is about.
+    Returns points, directions, steadiness and the counts of FilterCounts that this is about.
     """
     from taichi_edges.edges.growing import grow_points
     from taichi_edges.kernels.edgel_matching import EdgelMatching
@@ -75,26 +78,27 @@ def refined_points(points, directions, views, config, edge_threshold, generator)
 
     matching = EdgelMatching(views)
     found = refine_points(matching, points, directions)
-    supported, steady = judge(matching, found, config)
+    supported, steady, _ = judge(matching, found, config)
     refined, sizes = found.keep(steady), [len(found), supported.sum(), steady.sum()]
     if config.harvest:  # what an unsteady point explains is a contour, and no edge is to be looked for in it
         refined = refined.joined(harvest(matching, found.keep(supported), views, config, edge_threshold, generator))
     sizes.append(len(refined))
     if config.grow:
         refined = grow_points(matching, refined, config.grow)
-    supported, steady = judge(matching, refined, config)
+    supported, steady, steadiness = judge(matching, refined, config)
     sizes += [len(refined), supported.sum(), steady.sum()]
     weak, unsteady, harvested, grown, weak_later, unsteady_later = np.abs(np.diff(sizes)).tolist()
     counts = {"low_support": weak + weak_later, "unsteady": unsteady + unsteady_later}
     refined = refined.keep(steady)
-    return refined.points, refined.directions, {**counts, "harvested": harvested, "grown": grown}
+    return refined.points, refined.directions, steadiness[steady], {**counts, "harvested": harvested, "grown": grown}
 
 
 def judge(matching, refined, config):
     """(n,) bool: which RefinedPoints have edgels of their own; and which of these stay on them as the viewpoint moves.
 
     An occluding contour does not: its support comes from views that happen to look from similar directions. Steadiness
-    is a matter of an edge and not of a point, so the median of a neighbourhood decides.
+    is a matter of an edge and not of a point, so the median of a neighbourhood decides, and leniently: there will be
+    surer evidence when the edges are known (`drop_contours`). Returns also the (n,) steadiness.
     """
     from taichi_edges.explaining import explain
 
@@ -103,8 +107,19 @@ def judge(matching, refined, config):
     steady, places = supported.copy(), refined.points[supported]
     if len(places):
         around = cKDTree(places).query(places, min(AROUND, len(places)))[1].reshape(len(places), -1)
-        steady[supported] = np.median(explained.steadiness[supported][around], axis=1) >= config.min_steadiness
-    return supported, steady
+        steady[supported] = np.median(explained.steadiness[supported][around], axis=1) >= LENIENT * config.min_steadiness
+    return supported, steady, explained.steadiness
+
+
+def drop_contours(labels, steadiness, least):
+    """(n,) labels without the clusters whose mean steadiness is below `least`, and the number of these."""
+    if labels.max(initial=-1) < 0:
+        return labels, 0
+    clustered = labels >= 0
+    sums = np.bincount(labels[clustered], steadiness[clustered])
+    kept = sums >= least * np.bincount(labels[clustered])
+    numbers = np.where(kept, np.cumsum(kept) - 1, -1)
+    return np.where(clustered, numbers[labels], -1), int((~kept).sum())
 
 
 def harvest(matching, refined, views, config, edge_threshold, generator):
@@ -120,7 +135,8 @@ def harvest(matching, refined, views, config, edge_threshold, generator):
     seeds = vote_seeds(left, edge_threshold, generator, keep=HARVEST_KEEP)
     matching = EdgelMatching(left)
     found = refine_points(matching, seeds.points, seeds.directions)
-    return found.keep(judge(matching, found, config)[1])
+    steady = judge(matching, found, config)[1]
+    return found.keep(steady)
 
 
 def statistical_inliers(points, neighbors, deviations):

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from taichi_edges.cameras import NEAR
 from taichi_edges.kernels.device import download, upload
-from taichi_edges.kernels.points import F32_2D, F32_3D, I32_1D, I32_2D, blocks_of, load_camera, load_point
+from taichi_edges.kernels.points import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D, blocks_of, load_camera, load_point
 from taichi_edges.support import pixel_size
 
 CELL = 8  # px; side of the cells in which edgels are looked up, at least the largest radius
@@ -25,7 +25,7 @@ class EdgelGrid:
     """The edgels of all views in cells of CELL x CELL pixels, for look-ups by kernels.
 
     starts: (V * rows * columns + 1,) int32, where each cell begins in `elements` (n, 4): u, v and the unit normal.
-    order: (n,) the index in Edgels of each element. rows, columns: cells in a view.
+    strengths: (n,) float32 of the elements. order: (n,) the index in Edgels of each element. rows, columns: cells in a view.
     """
 
     def __init__(self, edgels, height, width):
@@ -37,6 +37,7 @@ class EdgelGrid:
         self.starts = upload(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32))
         elements = np.concatenate([edgels.points, edgels.normals], axis=1)[self.order]
         self.elements = upload(elements.astype(np.float32))
+        self.strengths = upload(edgels.strengths[self.order].astype(np.float32))
 
 
 class EdgelMatching:
@@ -69,7 +70,8 @@ class EdgelMatching:
         points, directions = (upload(np.asarray(array, np.float32)) for array in (points, directions))
         grid = (self.grid.rows, self.grid.columns, self.grid.starts, self.grid.elements)
         gates = float(radius), MOST_SINE, float(scale)
-        add_equations(*blocks_of(points), points, directions, self.cameras, *self.size, *grid, *gates, equations)
+        edgels = (*self.size, *grid, self.grid.strengths)
+        add_equations(*blocks_of(points), points, directions, self.cameras, *edgels, *gates, equations)
         return download(equations)
 
     def matches(self, points, directions, views, radius):
@@ -154,6 +156,7 @@ def add_equations(
     columns: ti.i32,
     starts: I32_1D,
     elements: F32_2D,
+    strengths: F32_1D,
     radius: ti.f32,
     most_sine: ti.f32,
     scale: ti.f32,
@@ -162,8 +165,9 @@ def add_equations(
     """Normal equations of the viewing planes of the edgels matched by each point.
 
     An edgel with normal m asks for m . (projection - edgel) = 0: a plane in space, of slope j = m^T dprojection/dpoint
-    (px per unit). With the residual r (px) and Geman-McClure's weight w = 1 / (1 + (r / scale)^2)^2, `equations` gets
-    w j j^T (upper triangle, 6), w r j (3), sum of w, and the number of views that have the point in the image.
+    (px per unit). With the residual r (px) and the weight w, the edgel's strength times Geman and McClure's
+    1 / (1 + (r / scale)^2)^2, `equations` gets the sums of w j j^T (upper triangle, 6), w r j (3) and w over the views,
+    then the number of views that have the point in the image.
     """
     for block in range(blocks):
         for view in range(cameras.shape[0]):
@@ -179,7 +183,7 @@ def add_equations(
                         edgel = ti.Vector([elements[element, 0], elements[element, 1]])
                         residual = normal.dot(pixel - edgel)
                         slope = normal @ slopes
-                        weight = 1.0 / (1.0 + (residual / scale) ** 2) ** 2
+                        weight = strengths[element] / (1.0 + (residual / scale) ** 2) ** 2
                         k = 0
                         for a in ti.static(range(3)):
                             for b in ti.static(range(a, 3)):
