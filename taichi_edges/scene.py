@@ -160,7 +160,7 @@ class FilterConfig(Section):
 
     min_opacity: Share = Field(0.2)
     min_support: Share = Field(0.05, description="share of the views that see a point and have an edge pixel there")
-    refine: bool = Field(True, description="move points to where the viewing planes of their edgels meet")
+    refine: bool = Field(False, description="move points to where the viewing planes of their edgels meet")
     min_steadiness: Share = Field(
         0.72, description="refine: share of the unexplained edgels near an edge that lie on it, relative to sure edges"
     )

@@ -30,10 +30,11 @@ def prepare(run):
         return _prepare_synthetic(run)
     from taichi_edges.detectors import DETECTORS, choose_detector
     from taichi_edges.readers import READERS
-    from taichi_edges.readers.frames import build_views, chosen_frames
+    from taichi_edges.readers.frames import build_views, camera_poses, chosen_frames
 
     source = run.config.source
     frames = chosen_frames(READERS[source.reader](run.data_path(source.path, "source.path"), source), source.skip)
+    camera_poses(frames)  # a mistake in them shall not wait for the detector
     detector = choose_detector(source, frames)
     frames, edge_maps, edgels = DETECTORS[detector](frames, run)
     views = build_views(frames, edge_maps, edgels, source, run.config.box, run.progress)

@@ -588,7 +588,7 @@ def filtered(points, opacities=None, **config):
     opacities = np.ones(len(points)) if opacities is None else opacities
     directions = np.stack([np.arange(len(points)), np.zeros(len(points)), np.zeros(len(points))], axis=1)
     settings = FilterConfig(**{"outlier_neighbors": 0, **config})
-    found, kept, counts = filter_points(points, directions, opacities, four_views(), settings, 0.5)
+    found, kept, _, counts = filter_points(points, directions, opacities, four_views(), settings, 0.5, None)
     np.testing.assert_array_equal(found, np.asarray(points)[kept[:, 0].astype(int)])
     assert counts.gaussians == len(points)
     assert counts.gaussians - counts.low_opacity - counts.low_support - counts.outliers == len(found)
@@ -615,7 +615,7 @@ def test_support_counts_only_the_views_that_see_a_point(taichi):
     views = Views(views.names, views.edge_maps, views.intrinsics, away, views.image_paths)
     points = points_on_column(3)
     settings = FilterConfig(min_support=1.0, outlier_neighbors=0)
-    assert len(filter_points(points, points, np.ones(3), views, settings, 0.5)[0]) == 3
+    assert len(filter_points(points, points, np.ones(3), views, settings, 0.5, None)[0]) == 3
 
 
 def test_support_is_a_share_of_the_views(taichi):
@@ -626,7 +626,7 @@ def test_support_is_a_share_of_the_views(taichi):
     points = points_on_column(3)
     for share, expected in ((0.25, 3), (0.26, 0)):
         settings = FilterConfig(min_support=share, outlier_neighbors=0)
-        assert len(filter_points(points, points, np.ones(3), views, settings, 0.5)[0]) == expected
+        assert len(filter_points(points, points, np.ones(3), views, settings, 0.5, None)[0]) == expected
 
 
 def test_isolated_points_are_outliers(generator):

@@ -14,7 +14,8 @@ from taichi_edges.cameras import OPENGL_TO_OPENCV, inside_image, invert_pose, pr
 from taichi_edges.errors import UserError
 from taichi_edges.progress import Progress
 from taichi_edges.readers import READERS
-from taichi_edges.readers.frames import build_views, read_grey
+from taichi_edges.readers.frames import build_views, chosen_frames
+from taichi_edges.readers.images import frames_with_images, read_edge_maps, read_grey
 from taichi_edges.scene import SourceConfig
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import Imperfections, render_edge_maps, ring_cameras
@@ -39,6 +40,12 @@ class Warnings(Progress):
 
     def warn(self, text):
         self.texts.append(text)
+
+
+def views_of_maps(frames, config, box, warnings):
+    """Views with the ready edge maps of the frames, as the prepare stage reads them."""
+    frames = chosen_frames(frames, config.skip)
+    return build_views(frames, read_edge_maps(frames, warnings), None, config, np.asarray(box, float), warnings)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +102,7 @@ class Folder:
         self.listing.write_text(json.dumps(self.content) if text is None else text)
         edges = {"edges": "edge"} if self.kind == "emap" else {}
         config = SourceConfig(reader=self.kind, path="unused", **{**edges, **source})
-        return build_views(READERS[self.kind](self.path, config), config, np.asarray(box, float), self.warnings)
+        return views_of_maps(READERS[self.kind](self.path, config), config, box, self.warnings)
 
     def refusal(self, *arguments, **options):
         """The message with which the folder is refused: one line."""
@@ -290,7 +297,7 @@ def test_skipping_everything_is_refused(folder):
 
 
 def test_emap_without_a_folder_of_edges_is_refused(emap):
-    assert "source.edges is missing" in emap.refusal(edges="")
+    assert "no edge maps: set source.edges to their folder, or source.images" in emap.refusal(edges="")
 
 
 @pytest.mark.parametrize(
@@ -531,7 +538,7 @@ def test_true_edges_of_the_real_scenes_fall_on_edge_pixels(kind):
 
     path, source = REAL[kind]
     config = SourceConfig(reader=kind, path=path, skip=[], **source)
-    views = build_views(READERS[kind](Path(root) / path, config), config, UNIT_BOX, Warnings())
+    views = views_of_maps(READERS[kind](Path(root) / path, config), config, UNIT_BOX, Warnings())
     assert (len(views), views.width, views.height) == (50, 800, 800)
     points = read_ground_truth(Path(root) / path / "gt").points
     near = []

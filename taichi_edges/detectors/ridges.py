@@ -15,7 +15,7 @@ from taichi_edges.edgels import Edgels
 SIGMA_PER_WIDTH = 0.29  # 1 / (2 sqrt 3): the smallest scale at which a bar of that width has one ridge (Steger, eq. 17)
 MIN_SIGMA = 0.8  # px; below, the derivative of the Gaussian is not sampled well
 MIN_CURVATURE = 0.1  # of that of a line as narrow as the scale; on a flank rounding alone leaves a faint curvature
-HALF_PIXEL = 0.6  # px; a ridge between two pixels is 0.5 from either or, as values vary, some more: twice beats never
+HALF_PIXEL = 0.6  # px; a ridge half-way between two pixels is 0.5 from either or, by the curvature's error, some more
 MIN_PIXELS = 6  # a ridge of fewer is no line
 
 
@@ -64,10 +64,24 @@ def ridge_points(edge_map, sigma, threshold):
         offset = -(gx * nx + gy * ny) / curvature
     du, dv = offset * nx, offset * ny
     sharp = curvature < -MIN_CURVATURE * values / sigma**2
-    bright[rows, columns] = sharp & (np.abs(du) <= HALF_PIXEL) & (np.abs(dv) <= HALF_PIXEL)
+    bright[rows, columns] = sharp & _is_nearest(bright.shape, sharp, rows, columns, du, dv)
     on_ridge = _without_specks(bright, rows, columns)
     points = np.stack([left + columns + du, top + rows + dv], axis=1)[on_ridge]
     return points, np.stack([nx, ny], axis=1)[on_ridge], values[on_ridge]
+
+
+def _is_nearest(shape, sharp, rows, columns, du, dv):
+    """(n,) bool: which pixels are the nearest to their ridge, (du, dv) px away; of two that are half-way, one at least."""
+    farthest = np.maximum(np.abs(du), np.abs(dv))
+    inside = farthest <= 0.5
+    claimed = np.zeros(shape, bool)
+    claimed[rows, columns] = sharp & inside
+    almost = np.flatnonzero(sharp & ~inside & (farthest <= HALF_PIXEL))
+    beyond_row = rows[almost] + np.where(np.abs(dv[almost]) > 0.5, np.sign(dv[almost]), 0).astype(int)
+    beyond_column = columns[almost] + np.where(np.abs(du[almost]) > 0.5, np.sign(du[almost]), 0).astype(int)
+    beyond = np.clip(beyond_row, 0, shape[0] - 1), np.clip(beyond_column, 0, shape[1] - 1)
+    inside[almost] = ~claimed[beyond]
+    return inside
 
 
 def _window(edge_map, threshold, margin):

@@ -74,9 +74,8 @@ def build_views(frames, edge_maps, edgels, config, box, progress):
     edge_maps: (V, H, W) uint8. edgels: Edgels, or None where they are still to be traced. config: the scene's `source`
     section. box: (2, 3) corners, input units.
     """
-    poses = np.stack([matrix(pose, (4, 4), frames.where, f"the pose of {name}") for name, pose in _each(frames)])
-    _check_poses(frames, poses)
     opengl = frames.opengl if config.axes == "auto" else config.axes == "opengl"
+    poses = camera_poses(frames)
     poses = poses @ OPENGL_TO_OPENCV if opengl else poses
     height, width = edge_maps.shape[1:]
     intrinsics = np.stack([intrinsics_for(width, height) for intrinsics_for in frames.intrinsics])
@@ -95,6 +94,13 @@ def build_views(frames, edge_maps, edgels, config, box, progress):
         input_to_truth=frames.input_to_truth,
         edgels=edgels,
     )
+
+
+def camera_poses(frames):
+    """(V, 4, 4) camera-to-world as the file has them; UserError where one is no rigid motion."""
+    poses = np.stack([matrix(pose, (4, 4), frames.where, f"the pose of {name}") for name, pose in _each(frames)])
+    _check_poses(frames, poses)
+    return poses
 
 
 def into_unit_cube(world_to_camera, similarity):
