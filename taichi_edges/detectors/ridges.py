@@ -16,6 +16,7 @@ SIGMA_PER_WIDTH = 0.29  # 1 / (2 sqrt 3): the smallest scale at which a bar of t
 MIN_SIGMA = 0.8  # px; below, the derivative of the Gaussian is not sampled well
 MIN_CURVATURE = 0.1  # of that of a line as narrow as the scale; on a flank rounding alone leaves a faint curvature
 HALF_PIXEL = 0.6  # px; a ridge half-way between two pixels is 0.5 from either or, by the curvature's error, some more
+HALF_DIAGONAL = 0.72  # px; of a pixel, or a rounding more
 MIN_PIXELS = 6  # a ridge of fewer is no line
 
 
@@ -76,7 +77,7 @@ def _is_nearest(shape, sharp, rows, columns, du, dv):
     inside = farthest <= 0.5
     claimed = np.zeros(shape, bool)
     claimed[rows, columns] = sharp & inside
-    almost = np.flatnonzero(sharp & ~inside & (farthest <= HALF_PIXEL))
+    almost = np.flatnonzero(sharp & ~inside & (farthest <= HALF_PIXEL) & (np.hypot(du, dv) <= HALF_DIAGONAL))
     beyond_row = rows[almost] + np.where(np.abs(dv[almost]) > 0.5, np.sign(dv[almost]), 0).astype(int)
     beyond_column = columns[almost] + np.where(np.abs(du[almost]) > 0.5, np.sign(du[almost]), 0).astype(int)
     beyond = np.clip(beyond_row, 0, shape[0] - 1), np.clip(beyond_column, 0, shape[1] - 1)
