@@ -9,10 +9,18 @@ import pytest
 from scipy.spatial import cKDTree
 
 from taichi_edges.cameras import project
+from taichi_edges.detectors import consensus as consensus_module
 from taichi_edges.detectors.backgrounds import flooded, image_steps, look_beside, sample, smooth_step
 from taichi_edges.detectors.calibration import calibrate, sides_of
 from taichi_edges.detectors.consensus import Consensus, across, edgel_table
-from taichi_edges.detectors.offsets import Observations, fit_offsets, neighbourhoods, standard_errors
+from taichi_edges.detectors.offsets import (
+    Observations,
+    camera_leverage,
+    fit_offsets,
+    neighbourhoods,
+    standard_errors,
+)
+from taichi_edges.detectors.offsets import _solve as solve
 from taichi_edges.detectors.ridges import trace_ridges
 from taichi_edges.synthetic.drawing import Imperfections, draw_edge_map
 from taichi_edges.synthetic.parts import PARTS
@@ -193,12 +201,20 @@ def test_too_few_points_and_no_images_leave_the_edgels_alone(part, generator):
     assert found.silhouette_applied and not np.array_equal(corrected.points, edgels.points)
 
 
-def test_points_that_the_views_do_not_agree_on_say_nothing(part, generator):
+def test_points_that_the_views_do_not_agree_on_say_nothing(part, generator, monkeypatch):
     views, edgels = planted(part, SHIFT, OFFSET, images=False)
-    angles = generator.uniform(0, 2 * np.pi, VIEWS)
-    poses_off = 1.5 * np.stack([np.cos(angles), np.sin(angles)], axis=1)  # px, of each view
-    _, found = calibrate(views, edgels.moved(poses_off[edgels.views]), *seeds(part, generator))
-    assert "only" in found.reason and not found.shift_applied and not found.silhouette_applied
+    monkeypatch.setattr(consensus_module, "MOST_RESIDUAL", 0.001)
+    _, found = calibrate(views, edgels, *seeds(part, generator))
+    assert "agree on 3D points to" in found.reason and not found.shift_applied and not found.silhouette_applied
+
+
+def test_errors_through_points_cover_cameras_that_are_a_little_wrong(part, generator):
+    views, edgels = planted(part, SHIFT, OFFSET, images=False)
+    cameras = generator.normal(0, 0.1, (VIEWS, 2))
+    _, found = calibrate(views, edgels.moved(cameras[edgels.views]), *seeds(part, generator))
+    assert np.abs(found.shift_error).max() < 0.4 and found.silhouette_error < 0.2
+    assert (np.abs(found.shift - SHIFT) < 4 * found.shift_error).all()
+    assert abs(found.silhouette - OFFSET) < 4 * found.silhouette_error
 
 
 def test_maps_without_edges_are_no_problem(part, generator):
@@ -250,6 +266,18 @@ def test_eliminated_points_give_what_dense_least_squares_give(generator):
     np.testing.assert_allclose(fit.values, expected[:3], atol=1e-3)
     np.testing.assert_allclose(fit.displacements.reshape(-1), expected[3:], atol=1e-3)
     np.testing.assert_allclose(fit.values, values, atol=0.03)
+
+
+def test_leverage_of_the_cameras_is_what_moving_views_does(generator):
+    observations = observations_of(generator, 900, 30, np.zeros(3), np.zeros((30, 2)), 0.05)
+    fit = fit_offsets(observations, UNKNOWN, 30)
+    found = []
+    for view, axis in np.ndindex(20, 2):
+        moved = np.where(observations.views == view, 1e-4 * observations.normals[:, axis], 0.0)
+        again = solve(replace(observations, offsets=moved), fit.weights, UNKNOWN, 30)[0]
+        found.append(again / 1e-4)
+    expected = np.linalg.norm(found, axis=0)
+    np.testing.assert_allclose(camera_leverage(observations, fit, UNKNOWN, 30), expected, rtol=1e-6)
 
 
 def test_a_third_of_outliers_does_not_move_the_fit(generator):

@@ -10,6 +10,7 @@ from taichi_edges.detectors.offsets import (
     LEAST_OBSERVATIONS,
     Estimate,
     Observations,
+    camera_leverage,
     fit_offsets,
     standard_errors,
 )
@@ -23,6 +24,7 @@ MOST_SILHOUETTE = 0.85  # of a point's observations; with more it cannot tell it
 # that no leaving out of observations shows: interior edges have small biases of their own, which points on them take
 # over. On exact CAD models, with residuals of 0.17 px, the offset came out wrong by 0.17 px and the shift by 0.08.
 OWN_ERRORS = np.array([0.6, 0.4, 0.4])
+CAMERA_ERROR = 0.1  # px; cameras are not known better, whatever the residuals say
 MOST_RESIDUAL = 0.35  # px, median; where views agree no better, as on textured photographs, chance has made the pairs
 WALK, STEP = 8.0, 1.0  # px to each side of a projection that are looked at; lines in an edgel table are two px or more
 SAME_LINE = 2.5  # px; edgels farther apart across the edge are of two lines
@@ -64,8 +66,9 @@ class Consensus:
         if residual > MOST_RESIDUAL:
             return None, f"the views agree on 3D points to {residual:.2f} px only; {MOST_RESIDUAL} px are needed"
         errors = standard_errors(observations, fit, known, self.points)
+        cameras = max(residual, CAMERA_ERROR) * camera_leverage(observations, fit, known, len(self.points))
         own = OWN_ERRORS * residual * np.isnan(known)
-        return Estimate(fit.values, np.hypot(errors, own), "points"), ""
+        return Estimate(fit.values, np.sqrt(errors**2 + cameras**2 + own**2), "points"), ""
 
     def observe(self, values, reach):
         """Observations of the points by edgels, sought without the biases `values`, (3,) px, at most `reach` px away.

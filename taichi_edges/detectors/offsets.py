@@ -112,6 +112,26 @@ def standard_errors(observations, fit, known, points=None):
     return np.where(np.isnan(known), np.sqrt(variances) * _stiffness(fit.robust), 0.0)
 
 
+def camera_leverage(observations, fit, known, count):
+    """(3,): standard errors of the values for cameras that are wrong by 1 px in each image coordinate, each by itself.
+
+    A shift of the maps is hard to tell from a displacement of all points where the cameras stand alike, and then small
+    errors of the cameras make a large one of the shift. Points soak them up, so that residuals hardly show them.
+    """
+    columns = observations.columns * np.isnan(known)
+    weighted = columns * fit.weights[:, None]
+    inverses, crossed, _ = _point_equations(observations, fit.weights, weighted, observations.offsets, count)
+    # What moving one observation by 1 px does to the values, once the points have given way.
+    moved = np.einsum("mk,mkj->mj", observations.slopes, (inverses @ crossed)[observations.owners])
+    influences = (columns - moved) * fit.weights[:, None] @ np.linalg.inv(fit.matrix)
+    sums = [
+        np.bincount(observations.views, influences[:, value] * observations.normals[:, axis])
+        for value in range(3)
+        for axis in (0, 1)
+    ]
+    return np.sqrt((np.array(sums).reshape(3, -1) ** 2).sum(axis=1))
+
+
 def _stiffness(robust):
     """By how much constant weights understate what an observation moves a robust fit: E[weight] / E[influence'].
 
