@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from taichi_edges.detectors.offsets import Observations
+from taichi_edges.detectors.ridges import gaussian_derivatives
 
 FAINT = 0.15  # of full scale; where an edge map is brighter, the flood does not pass
 CLOSED_GAP = 4.0  # px; half the width of the gaps in an outline through which the flood does not leak
@@ -65,6 +66,11 @@ class Sides:
                 off = np.abs(depths[some] - np.median(depths[some]))
                 weights[some] *= smooth_step((DEPTH_NONE - off) / (DEPTH_NONE - DEPTH_FULL))
         return weights
+
+    def correct(self, edgels, values):
+        """The n edgels without the biases (3,) px: outward offset of silhouettes, shift; and (n,) `silhouettes`."""
+        weights = self.silhouettes(values[1:])
+        return edgels.moved(-values[1:] - values[0] * weights[:, None] * self.outward), weights
 
     def observations(self, views, shift=(0.0, 0.0)):
         """Observations of the edgels of maps shifted by so many px against the images. views: (n,) int.
@@ -155,17 +161,17 @@ def sample(image, points, directions, along):
 
 def image_steps(grey, points, directions):
     """(n,) px along `directions` from each point to the one strong step of an image's brightness across it, or NaN."""
-    smooth = cv2.GaussianBlur(grey, (0, 0), STEP_SIGMA)
     along = np.arange(-STEP_REACH - 1, STEP_REACH + 1.25, ALONG_STEP)
-    profiles = sample(smooth, points, directions, along)
-    slopes = np.abs(profiles[:, 2:] - profiles[:, :-2]) / (2 * ALONG_STEP)
-    along = along[1:-1]
-    best = slopes.argmax(axis=1)
-    rows, middle = np.arange(len(points)), np.clip(best, 1, len(along) - 2)
-    before, peak, after = (slopes[rows, middle + step] for step in (-1, 0, 1))
+    slopes, derivatives = 0.0, gaussian_derivatives(grey, STEP_SIGMA)
+    for axis in (0, 1):
+        slopes = slopes + sample(next(derivatives), points, directions, along) * directions[:, axis, None]
+    slopes, width = np.abs(slopes), round(1 / ALONG_STEP)  # samples in a pixel
+    middle = np.clip(slopes.argmax(axis=1), width, len(along) - 1 - width)
+    rows = np.arange(len(points))
+    before, peak, after = (slopes[rows, middle + step] for step in (-width, 0, width))
     with np.errstate(divide="ignore", invalid="ignore"):
         top = 0.5 * (before - after) / (before - 2 * peak + after)
-    far = np.abs(along - along[best][:, None]) > 2.5 * STEP_SIGMA
-    others = np.where(far, slopes, 0).max(axis=1)
-    good = (best == middle) & (np.abs(along[middle]) <= STEP_REACH) & (peak >= LEAST_STEP) & (others < ALONE * peak)
-    return np.where(good & (np.abs(top) <= 1), along[middle] + top * ALONG_STEP, np.nan)
+    far = np.abs(along - along[middle][:, None]) > 2.5 * STEP_SIGMA
+    alone = np.where(far, slopes, 0).max(axis=1) < ALONE * peak
+    good = alone & (np.abs(along[middle]) <= STEP_REACH) & (peak >= LEAST_STEP) & (np.abs(top) <= ALONG_STEP)
+    return np.where(good, along[middle] + top, np.nan)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+LEAST_OBSERVATIONS = 200  # fewer tell nothing
 NOTHING_KNOWN = 100.0  # px; prior standard deviation of an offset: one that nothing observes keeps it as its error
 FREE_WAY = 10.0  # px; prior standard deviation of a point's displacement, far beyond what seeds are off
 ABSOLUTE_ROUNDS, REDESCENDING_ROUNDS = 4, 8  # first least absolute values, from anywhere; then outliers drop out
@@ -13,6 +14,7 @@ CUT = 2.0  # standard deviations of the residuals at which the Geman-McClure wei
 # interior edgels, which have none, shall say where it is.
 INTERIOR_WEIGHT = 3.0
 NORMAL_MAD = 1.4826  # standard deviations for each median absolute deviation, of a normal distribution
+MOST_STIFF = 3.0  # a fit with more has hardly an optimum
 VIEW_BLOCKS, SPLITS = 10, 4  # views next to each other, and halves of halves of the points, that are left out together
 
 
@@ -56,7 +58,8 @@ class Fit:
 
     values:        (3,) px: outward offset of silhouettes, shift in x and y.
     displacements: (n, 2) px, of the points; None where there are none.
-    residuals:     (m,) px, offset - model. weights: (m,) of the observations in the end.
+    residuals:     (m,) px, offset - model.
+    weights:       (m,) of the observations in the end; robust: (m,) 0..1, the part that their residuals have in them.
     matrix:        (3, 3) of the values' normal equations.
     """
 
@@ -64,7 +67,17 @@ class Fit:
     displacements: np.ndarray | None
     residuals: np.ndarray
     weights: np.ndarray
+    robust: np.ndarray
     matrix: np.ndarray
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """values, errors: (3,) px, outward offset of silhouettes and shift, with standard errors. method: how found."""
+
+    values: np.ndarray
+    errors: np.ndarray
+    method: str
 
 
 def fit_offsets(observations, known, count=None):
@@ -79,7 +92,7 @@ def fit_offsets(observations, known, count=None):
         values, displacements, matrix = _solve(observations, weights * robust, known, count)
         residuals = _residuals(observations, values, displacements)
         robust = _weights(residuals, redescending=round_ >= ABSOLUTE_ROUNDS)
-    return Fit(values, displacements, residuals, weights * robust, matrix)
+    return Fit(values, displacements, residuals, weights * robust, robust, matrix)
 
 
 def standard_errors(observations, fit, known, points=None):
@@ -96,7 +109,35 @@ def standard_errors(observations, fit, known, points=None):
     if points is not None:
         blocks = neighbourhoods(points)[observations.owners]
         variances += _jackknife(observations, fit.weights, known, count, blocks)
-    return np.where(np.isnan(known), np.sqrt(variances), 0.0)
+    return np.where(np.isnan(known), np.sqrt(variances) * _stiffness(fit.robust), 0.0)
+
+
+def camera_leverage(observations, fit, known, count):
+    """(3,): standard errors of the values for cameras that are wrong by 1 px in each image coordinate, each by itself.
+
+    A shift of the maps is hard to tell from a displacement of all points where the cameras stand alike, and then small
+    errors of the cameras make a large one of the shift. Points soak them up, so that residuals hardly show them.
+    """
+    columns = observations.columns * np.isnan(known)
+    weighted = columns * fit.weights[:, None]
+    inverses, crossed, _ = _point_equations(observations, fit.weights, weighted, observations.offsets, count)
+    # What moving one observation by 1 px does to the values, once the points have given way.
+    moved = np.einsum("mk,mkj->mj", observations.slopes, (inverses @ crossed)[observations.owners])
+    influences = (columns - moved) * fit.weights[:, None] @ np.linalg.inv(fit.matrix)
+    sums = [
+        np.bincount(observations.views, influences[:, value] * observations.normals[:, axis])
+        for value in range(3)
+        for axis in (0, 1)
+    ]
+    return np.sqrt((np.array(sums).reshape(3, -1) ** 2).sum(axis=1))
+
+
+def _stiffness(robust):
+    """By how much constant weights understate what an observation moves a robust fit: E[weight] / E[influence'].
+
+    Where residuals r change the weights, w = (1 + r^2)^-2, the influence is r w and its derivative 4 w^1.5 - 3 w.
+    """
+    return np.clip(robust.sum() / max((4 * robust**1.5 - 3 * robust).sum(), 1e-9), 1.0, MOST_STIFF)
 
 
 def _weights(residuals, redescending):
