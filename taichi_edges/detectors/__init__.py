@@ -42,14 +42,14 @@ def detect_onnx(frames, run):
 
     frames, onnx = frames_with_images(frames, run.progress), run.config.source.onnx
     model = run.data_path(onnx.model, "source.onnx.model")
-    images = CompositedImages(frames.image_paths)
-    maps = detect_maps(images, model, onnx.network, onnx.scale, onnx.flip, run.threads, run.progress)
+    images = ComposedImages(frames.image_paths)
+    maps = detect_maps(images, model, onnx.network or None, onnx.scale, onnx.flip, run.threads, run.progress)
     check_sizes(frames, [(edge_map.shape[1], edge_map.shape[0]) for edge_map in maps], "colour image")
     return frames, np.stack(maps), None
 
 
-class CompositedImages:
-    """The images of some paths, each decoded when it is asked for: (H, W, 3) uint8 RGB, composited over white."""
+class ComposedImages:
+    """The images of some paths, each decoded when it is asked for: (H, W, 3) uint8 RGB, transparent ones over white."""
 
     def __init__(self, paths):
         self.paths = paths
@@ -58,9 +58,12 @@ class CompositedImages:
         return len(self.paths)
 
     def __getitem__(self, index):
-        from taichi_edges.detectors.pictures import read_composited
+        from taichi_edges.detectors.pictures import read_colour
 
-        return read_composited(self.paths[index])
+        colour = read_colour(self.paths[index])
+        if colour is None:
+            raise UserError(f"{self.paths[index]}: not an image that can be read; export it again, or skip this view")
+        return colour[:, :, ::-1]
 
 
 DETECTORS = {"maps": read_maps, "subpixel": detect_subpixel, "onnx": detect_onnx}

@@ -118,13 +118,13 @@ def preset_for(model_path, preset=None):
     if preset:
         if preset.lower() not in PRESETS:
             hint = did_you_mean(preset.lower(), PRESETS) or f"; there is {names}"
-            raise UserError(f"model: '{preset}' is not a known network{hint}")
+            raise UserError(f"source.onnx.network: '{preset}' is not a known network{hint}")
         return PRESETS[preset.lower()]
     # At the start of a word: 'published.onnx' is no HED.
     found = [name for name in PRESETS if re.search(rf"(?<![a-z]){name}", Path(model_path).stem.lower())]
     if len(found) != 1:
         why = f"holds {' and '.join(found)}" if found else "does not say which network this is"
-        raise UserError(f"{model_path}: the file's name {why}; set model to one of {names}")
+        raise UserError(f"{model_path}: the file's name {why}; set source.onnx.network to one of {names}")
     return PRESETS[found[0]]
 
 

@@ -94,3 +94,36 @@ def read_picture(path, exponent=None):
     if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
         raise UserError(f"{path}: pixels of type {image.dtype}; export it with 8 or 16 bits a channel")
     return as_picture(image, exponent)
+
+
+def srgb_of_light(light):
+    """sRGB-encoded values, float32 0..1, of linear light."""
+    light = np.clip(np.asarray(light, np.float32), 0.0, 1.0)
+    power = (1 + SRGB_OFFSET) * light ** (1 / SRGB_POWER) - SRGB_OFFSET
+    return np.where(light <= SRGB_LINEAR / SRGB_SLOPE, light * SRGB_SLOPE, power).astype(np.float32)
+
+
+def read_colour(path):
+    """An image as people and learned detectors see it: (H, W, 3) uint8 BGR, what is transparent over white.
+
+    Composited in linear light. None where the file cannot be read.
+    """
+    try:
+        image = cv2.imdecode(np.frombuffer(Path(path).read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    except (OSError, cv2.error):  # not there, not ours to read, or empty
+        return None
+    if image is None or image.dtype not in (np.uint8, np.uint16):
+        return None
+    full = np.iinfo(image.dtype).max
+    colour = image if full == 255 else (image * (255.0 / full)).round().astype(np.uint8)
+    if image.ndim == 2:
+        return cv2.cvtColor(colour, cv2.COLOR_GRAY2BGR)
+    if image.shape[2] == 3:
+        return colour
+    colour, alpha = cv2.cvtColor(colour, cv2.COLOR_BGRA2BGR), cv2.extractChannel(image, 3)
+    colour[alpha == 0] = 255
+    mixed = (alpha > 0) & (alpha < full)  # few, along outlines
+    share = (alpha[mixed, None] / full).astype(np.float32)
+    light = light_of_srgb(image[mixed, :3] / full) * share + (1 - share)
+    colour[mixed] = (255 * srgb_of_light(light)).round()
+    return colour

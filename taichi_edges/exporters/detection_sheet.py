@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 
 from taichi_edges.artefacts import replacing
-from taichi_edges.exporters.overlays import SAME_SHAPE, _read_colour, choose_views
+from taichi_edges.detectors.pictures import read_colour
+from taichi_edges.exporters.overlays import SAME_SHAPE, choose_views
 
 CELL_WIDTH = 400  # px of the sheet; six columns fit a wide screen
 CELL_HEIGHTS = (240, 480)  # px; the shape of the views between these
@@ -61,7 +62,7 @@ class Content:
     limit: float
 
 
-def write_detection_sheet(path, views, residuals=None, on_silhouette=None, picture_reader=None, count=6):
+def write_detection_sheet(path, views, residuals=None, on_silhouette=None, picture_reader=None, count=4):
     """Write the sheet: a row for each of `count` views that look in different directions. Returns the path.
 
     views: Views with edgels. residuals: (n,) px per edgel, signed, NaN where unknown. on_silhouette: (n,) bool, or
@@ -113,7 +114,7 @@ def median_and_mad(residuals):
 
 
 def _read_picture(path):
-    picture = _read_colour(path)
+    picture = read_colour(path)
     return None if picture is None else picture[:, :, ::-1]
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from taichi_edges.artefacts import replacing
 from taichi_edges.cameras import NEAR
+from taichi_edges.detectors.pictures import read_colour
 from taichi_edges.errors import UserError
 from taichi_edges.exporters.line_sets import line_set_arrays
 from taichi_edges.exporters.palette import CURVE_COLOUR, LINE_COLOUR
@@ -46,7 +47,7 @@ def draw_overlays(folder, views, edges_unit, count=4):
 
 def contact_sheet(paths, out):
     """Put pictures (paths, at least one, all of one size) side by side into one PNG, `out`, row by row."""
-    pictures = [_read_colour(path) for path in paths]
+    pictures = [read_colour(path) for path in paths]
     for path, picture in zip(paths, pictures, strict=True):
         if picture is None:
             raise UserError(f"{path}: not a readable picture; run the export again")
@@ -83,7 +84,7 @@ def choose_views(views, count):
 
 def background(views, view):
     """What is drawn on: (H, W, 3) uint8 BGR, the colour image of the view or its edge map, mixed with white."""
-    colour = _read_colour(views.image_paths[view]) if views.image_paths[view] else None
+    colour = read_colour(views.image_paths[view]) if views.image_paths[view] else None
     if colour is not None:
         height, width = colour.shape[:2]
         if abs(width * views.height / (height * views.width) - 1.0) < SAME_SHAPE:
@@ -184,28 +185,6 @@ def _end_vertices(segments, owners):
     changes = np.flatnonzero(np.diff(owners))
     first, last = np.concatenate([[0], changes + 1]), np.concatenate([changes, [len(owners) - 1]])
     return np.concatenate([segments[first, 0], segments[last, 1]]) if len(owners) else np.zeros(0, np.int64)
-
-
-def _read_colour(path):
-    """A picture as (H, W, 3) uint8 BGR, a transparent one on white; None where it cannot be read."""
-    try:
-        picture = cv2.imdecode(np.frombuffer(Path(path).read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
-    except (OSError, cv2.error):  # not there, not ours to read, or empty
-        return None
-    if picture is None or picture.dtype not in (np.uint8, np.uint16):
-        return None
-    full = np.iinfo(picture.dtype).max
-    colour = picture if full == 255 else (picture * (255.0 / full)).round().astype(np.uint8)
-    if picture.ndim == 2:
-        return cv2.cvtColor(colour, cv2.COLOR_GRAY2BGR)
-    if picture.shape[2] == 3:
-        return colour
-    colour, alpha = cv2.cvtColor(colour, cv2.COLOR_BGRA2BGR), cv2.extractChannel(picture, 3)
-    colour[alpha == 0] = 255
-    mixed = (alpha > 0) & (alpha < full)  # few, along outlines
-    share = alpha[mixed, None] / full
-    colour[mixed] = (picture[mixed, :3] * (255.0 / full) * share + 255.0 * (1.0 - share)).round()
-    return colour
 
 
 def _write_png(path, picture):
