@@ -15,7 +15,7 @@ from taichi_edges.errors import UserError
 from taichi_edges.progress import Progress
 from taichi_edges.readers import READERS
 from taichi_edges.readers.frames import build_views, chosen_frames
-from taichi_edges.readers.images import frames_with_images, read_edge_maps, read_grey
+from taichi_edges.readers.images import read_edge_maps, read_grey
 from taichi_edges.scene import SourceConfig
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import Imperfections, render_edge_maps, ring_cameras

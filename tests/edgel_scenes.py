@@ -1,0 +1,118 @@
+"""Views whose edgels are the exact projections of known 3D curves, and what may go wrong with them."""
+
+import numpy as np
+
+from taichi_edges.edgels import Edgels
+from taichi_edges.support import pixel_size
+from taichi_edges.synthetic.rendering import ring_cameras
+from taichi_edges.views import Views
+
+SIZE, VIEWS = 400, 24
+STEP = 1e-4  # unit-cube units, over which tangents are differences
+
+
+def line(start, end):
+    """A curve: function of s in 0..1 -> (n, 3)."""
+    start, end = np.asarray(start, float), np.asarray(end, float)
+    return lambda s: start + np.asarray(s)[:, None] * (end - start)
+
+
+def arc(centre, radius, angle=2 * np.pi):
+    """A horizontal circle, or the first `angle` radians of it."""
+    return lambda s: (
+        np.asarray(centre)
+        + radius * np.stack([np.cos(angle * np.asarray(s)), np.sin(angle * np.asarray(s)), np.zeros(len(s))], axis=1)
+    )
+
+
+def tangents(curve, s):
+    """(n, 3) unit tangents of a curve."""
+    along = curve(np.asarray(s) + STEP) - curve(np.asarray(s) - STEP)
+    return along / np.linalg.norm(along, axis=1, keepdims=True)
+
+
+def blank_views(count=VIEWS, cameras=None):
+    """Views around the unit cube, without edges."""
+    intrinsics, poses = cameras or ring_cameras(count, SIZE)
+    maps = np.zeros((count, SIZE, SIZE), np.uint8)
+    return Views(tuple(map(str, range(count))), maps, intrinsics, poses, ("",) * count)
+
+
+def project_edgels(views, view, curve, samples=1500):
+    """Points and normals, about half a pixel apart, of one curve in one view."""
+    s = np.linspace(0, 1, samples)
+    pixels, _ = views.project(curve(s), view)
+    ahead, _ = views.project(curve(s) + STEP * tangents(curve, s), view)
+    along = ahead - pixels
+    normals = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
+    travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(pixels, axis=0), axis=1))])
+    chosen = np.unique(np.searchsorted(travelled, np.arange(0, travelled[-1], 0.5)).clip(0, samples - 1))
+    return pixels[chosen], normals[chosen]
+
+
+def views_of(curves, generator, noise_px=0.0, hidden=0.0, cameras=None, count=VIEWS, strength=1.0):
+    """Views with the edgels of some curves.
+
+    curves: functions of s, or of (view, camera centre) that give one, for contours. noise_px: across each edgel.
+    hidden: share of the views in which a curve is not seen, drawn anew for each.
+    """
+    views = blank_views(count, cameras)
+    of_views = []
+    for view in range(count):
+        points, normals = [np.zeros((0, 2))], [np.zeros((0, 2))]
+        for curve in curves:
+            if generator.random() >= hidden:
+                seen = curve.seen_from(centre(views, view)) if hasattr(curve, "seen_from") else curve
+                for one, other in zip((points, normals), project_edgels(views, view, seen)):
+                    one.append(other)
+        points, normals = np.concatenate(points), np.concatenate(normals)
+        points = points + normals * generator.normal(0, noise_px, (len(points), 1))
+        of_views.append((points, normals, np.full(len(points), strength)))
+    return Views(
+        views.names,
+        views.edge_maps,
+        views.intrinsics,
+        views.world_to_camera,
+        views.image_paths,
+        edgels=Edgels.of_views(of_views),
+    )
+
+
+def centre(views, view):
+    """(3,) camera centre."""
+    return -views.world_to_camera[view, :, :3].T @ views.world_to_camera[view, :, 3]
+
+
+class CylinderContour:
+    """The right-hand contour of an upright cylinder: a vertical line that moves with the viewpoint."""
+
+    def __init__(self, middle, radius, low, high):
+        self.middle, self.radius, self.low, self.high = np.asarray(middle), radius, low, high
+
+    def seen_from(self, camera):
+        away = camera[:2] - self.middle
+        distance, bearing = np.linalg.norm(away), np.arctan2(away[1], away[0])
+        angle = bearing + np.arccos(self.radius / distance)
+        foot = self.middle + self.radius * np.array([np.cos(angle), np.sin(angle)])
+        return line([*foot, self.low], [*foot, self.high])
+
+
+def pixel_of(views):
+    """Size of a pixel, unit-cube units."""
+    return pixel_size(views)
+
+
+def displaced(curve, count, distance, generator):
+    """(count, 3) points of a curve, moved sideways by up to `distance`, and its tangents there."""
+    s = generator.uniform(0.05, 0.95, count)
+    along = tangents(curve, s)
+    sideways = np.cross(along, generator.normal(size=(count, 3)))
+    sideways *= distance * generator.random((count, 1)) / np.linalg.norm(sideways, axis=1, keepdims=True)
+    return curve(s) + sideways, along
+
+
+def distances_to(curve, points, samples=4000):
+    """(n,) distances of points to a curve."""
+    from scipy.spatial import cKDTree
+
+    return cKDTree(curve(np.linspace(0, 1, samples))).query(points)[0]

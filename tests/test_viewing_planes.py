@@ -1,0 +1,272 @@
+"""Points refined by the viewing planes of their edgels, explaining away, growing, and the filters built on them."""
+
+import numpy as np
+import pytest
+from edgel_scenes import (
+    SIZE,
+    CylinderContour,
+    arc,
+    blank_views,
+    centre,
+    displaced,
+    distances_to,
+    line,
+    pixel_of,
+    tangents,
+    views_of,
+)
+
+from taichi_edges.edgels import Edgels
+from taichi_edges.edges.filtering import drop_contours, filter_points, judge
+from taichi_edges.edges.growing import grow_points
+from taichi_edges.explaining import explain, unexplained
+from taichi_edges.kernels.edgel_matching import CELL, EdgelMatching
+from taichi_edges.scene import FilterConfig
+from taichi_edges.synthetic.rendering import ring_cameras
+from taichi_edges.viewing_planes import RADII_PX, refine_points
+from taichi_edges.views import read_views, write_views
+
+A = line([0.2, 0.3, 0.3], [0.8, 0.35, 0.4])
+RIM = arc([0.5, 0.5, 0.6], 0.25)
+
+
+@pytest.fixture
+def taichi(start_taichi):
+    start_taichi("f32", 2)
+
+
+def test_edgels_keep_their_views():
+    edgels = Edgels.of_views(
+        [(np.ones((2, 2)), np.ones((2, 2)), np.ones(2)), (np.zeros((0, 2)),) * 2 + (np.zeros(0),)]
+        + [(np.full((1, 2), 7.0), np.ones((1, 2)), np.array([0.5]))]
+    )
+    assert edgels.view_count == 3 and len(edgels) == 3
+    np.testing.assert_array_equal(edgels.views, [0, 0, 2])
+    assert len(edgels.of_view(1)[0]) == 0 and edgels.of_view(2)[2] == [0.5]
+    kept = edgels.keep(np.array([False, True, True]))
+    np.testing.assert_array_equal(kept.views, [0, 2])
+    np.testing.assert_allclose(edgels.moved(np.array([1.0, -1.0])).points[2], [8, 6])
+    assert len(Edgels.of_views([])) == 0
+
+
+def test_edgels_survive_the_disk(tmp_path, generator):
+    views = views_of([A], generator, count=3)
+    again = read_views(write_views(tmp_path / "views.npz", views))
+    for name in ("starts", "points", "normals", "strengths"):
+        np.testing.assert_array_equal(getattr(again.edgels, name), getattr(views.edgels, name))
+    assert read_views(write_views(tmp_path / "blank.npz", blank_views(2))).edgels is None
+
+
+@pytest.mark.parametrize("curve", [A, RIM], ids=["line", "circle"])
+def test_displaced_points_return_to_the_edge(taichi, generator, curve):
+    views = views_of([curve], generator)
+    pixel = pixel_of(views)
+    points, along = displaced(curve, 300, 2.0 * pixel, generator)
+    refined = refine_points(EdgelMatching(views), points, along)
+    assert distances_to(curve, refined.points).max() < 0.1 * pixel
+    # An error of 0.1 px over the 3 px around a point would be 2 degrees.
+    s = np.linspace(0, 1, 4000)
+    nearest = np.linalg.norm(refined.points[:, None] - curve(s)[None], axis=2).argmin(axis=1)
+    assert np.abs((refined.directions * tangents(curve, s[nearest])).sum(axis=1)).min() > np.cos(np.radians(2))
+    assert refined.support.min() > 0.9 and refined.views.min() > 0.9 * len(views)
+
+
+def test_noise_of_the_edgels_averages_out(taichi, generator):
+    views = views_of([A], generator, noise_px=0.4)
+    points, along = displaced(A, 300, 1.0 * pixel_of(views), generator)
+    refined = refine_points(EdgelMatching(views), points, along)
+    # 24 views, of which each dimension across the edge gets half: 0.4 / sqrt(12) = 0.12 px a dimension, 0.16 in all;
+    # the robust weights lose some.
+    assert np.median(distances_to(A, refined.points)) < 0.25 * pixel_of(views)
+
+
+def test_another_edge_beside_it_in_some_views_does_not_pull(taichi, generator):
+    views = views_of([A], generator)
+    spoilt = []
+    for view in range(len(views)):
+        points, normals, strengths = views.edgels.of_view(view)
+        moved = points + 1.5 * normals if view % 3 == 0 else points  # hidden here; another line 1.5 px beside it
+        spoilt.append((moved, normals, strengths))
+    object.__setattr__(views, "edgels", Edgels.of_views(spoilt))
+    points, along = displaced(A, 200, 0.5 * pixel_of(views), generator)
+    refined = refine_points(EdgelMatching(views), points, along)
+    assert np.median(distances_to(A, refined.points)) < 0.1 * pixel_of(views)
+
+
+def test_edgels_across_the_direction_are_no_match(taichi, generator):
+    views = views_of([A], generator)
+    points, along = displaced(A, 50, 0.0, generator)
+    across = np.cross(along, np.cross(along, [0.0, 0.0, 1.0]) + 0.0)
+    refined = refine_points(EdgelMatching(views), points, across / np.linalg.norm(across, axis=1, keepdims=True))
+    assert refined.support.max() < 0.5
+
+
+def test_faint_edgels_count_for_less(taichi, generator):
+    points, along = displaced(A, 20, 0.0, generator)
+    sure, faint = (
+        refine_points(EdgelMatching(views_of([A], generator, strength=strength)), points, along)
+        for strength in (1.0, 0.3)
+    )
+    np.testing.assert_allclose(faint.views, 0.3 * sure.views, rtol=0.05)
+
+
+def test_points_no_view_sees_stay_where_they_are(taichi, generator):
+    matching = EdgelMatching(views_of([A], generator, count=6))
+    far = np.array([[0.5, 0.5, 50.0], [100.0, 0.0, 0.0], [0.5, 0.9, 0.9]])
+    refined = refine_points(matching, far, np.tile([1.0, 0, 0], (3, 1)))
+    np.testing.assert_array_equal(refined.points, far)
+    assert (refined.support == 0).all()
+    assert len(refine_points(matching, np.zeros((0, 3)), np.zeros((0, 3)))) == 0
+
+
+def test_matching_does_not_depend_on_threads(start_taichi, generator):
+    views = views_of([A, RIM], generator, noise_px=0.3)
+    points, along = displaced(RIM, 200, pixel_of(views), generator)
+    found = []
+    for threads in (1, 2):
+        start_taichi("f32", threads)
+        matching = EdgelMatching(views)
+        refined = refine_points(matching, points, along)
+        found.append((refined.points, refined.support, *matching.matches(points, along, slice(3, 9), 2.0)))
+    for one, other in zip(*found):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_matches_are_the_nearest_edgels_brute_force(taichi, generator):
+    views = views_of([A, RIM], generator, noise_px=1.0, count=4)
+    points, along = displaced(A, 60, 3 * pixel_of(views), generator)
+    matches, residuals, inside = EdgelMatching(views).matches(points, along, slice(0, 4), 3.0)
+    assert inside.all() and CELL >= max(RADII_PX)
+    for view in range(4):
+        pixels, _ = views.project(points, view)
+        ahead, _ = views.project(points + 1e-4 * along, view)
+        images = (ahead - pixels) / np.linalg.norm(ahead - pixels, axis=1, keepdims=True)
+        edgels, normals, _ = views.edgels.of_view(view)
+        apart = np.linalg.norm(pixels[:, None] - edgels[None], axis=2)
+        sines = np.abs(images @ normals.T)
+        apart[sines > 0.35] = np.inf
+        expected = np.where(apart.min(axis=1) < 3.0, apart.argmin(axis=1) + views.edgels.starts[view], -1)
+        clear = np.abs(sines - 0.35).min(axis=1) > 1e-4  # not decided by rounding
+        agree = expected[clear] == matches[clear, view]
+        assert agree.mean() > 0.98  # two edgels may be equally near
+        chosen = (matches[:, view] >= 0) & (expected == matches[:, view])
+        at = matches[chosen, view] - views.edgels.starts[view]
+        signed = ((pixels[chosen] - edgels[at]) * normals[at]).sum(axis=1)
+        np.testing.assert_allclose(residuals[chosen, view], signed, atol=2e-3)
+
+
+def narrow_cameras(count=16):
+    """Cameras that look from similar directions: a point behind an edge projects onto it in many of them."""
+    return tuple(array[:count] for array in ring_cameras(40 * count, SIZE, elevations=(30.0,)))
+
+
+def test_a_ghost_behind_an_edge_has_no_support_of_its_own(taichi, generator):
+    views = views_of([A], generator, cameras=narrow_cameras(), count=16)
+    matching, pixel = EdgelMatching(views), pixel_of(views)
+    edge, along = displaced(A, 200, 0.0, generator)
+    away = edge - centre(views, 8)
+    ghost = edge + 12 * pixel * away / np.linalg.norm(away, axis=1, keepdims=True)
+    both = refine_points(matching, np.concatenate([edge, ghost]), np.tile(along, (2, 1)), radii=(1.0,))
+    assert np.median(distances_to(A, both.points[200:])) > 8 * pixel
+    explained = explain(matching, both)
+    assert np.median(both.support[200:]) > 0.3  # it lies on edgels in many views
+    assert explained.support[:200].min() > 0.8
+    assert np.median(explained.support[200:]) < 0.05
+
+
+def test_a_contour_is_not_steady_and_an_edge_is(taichi, generator):
+    contour = CylinderContour([0.6, 0.5], 0.12, 0.2, 0.8)
+    views = views_of([A, contour], generator, noise_px=0.05)
+    matching = EdgelMatching(views)
+    edge, along = displaced(A, 200, 0.0, generator)
+    starts = [contour.seen_from(centre(views, view)) for view in range(0, len(views), 2)]
+    limbs = np.concatenate([start(np.linspace(0.1, 0.9, 40)) for start in starts])
+    upright = np.tile([0.0, 0.0, 1.0], (len(limbs), 1))
+    refined = refine_points(matching, np.concatenate([edge, limbs]), np.concatenate([along, upright]))
+    explained = explain(matching, refined)
+    assert explained.noise_px == pytest.approx(0.05, abs=0.03)
+    assert np.median(explained.steadiness[:200]) > 0.9
+    assert np.median(explained.steadiness[200:]) < 0.6
+    supported, steady, _ = judge(matching, refined, FilterConfig(refine=True, min_steadiness=0.72))
+    assert supported[:200].all() and steady[:200].mean() > 0.95
+    assert steady[200:].mean() < 0.3
+
+
+def test_what_no_point_lies_on_is_unexplained(taichi, generator):
+    views = views_of([A, RIM], generator)
+    matching = EdgelMatching(views)
+    refined = refine_points(matching, A(np.linspace(0, 1, 300)), tangents(A, np.linspace(0, 1, 300)))
+    left = unexplained(matching, refined)
+    alone = views_of([A], generator)
+    assert left.sum() == pytest.approx(len(views.edgels) - len(alone.edgels), rel=0.02)
+
+
+def test_half_an_edge_grows_to_its_ends_and_not_beyond(taichi, generator):
+    for curve in (A, arc([0.5, 0.5, 0.6], 0.25, np.pi)):
+        views = views_of([curve], generator, noise_px=0.05)
+        matching, pixel = EdgelMatching(views), pixel_of(views)
+        s = np.linspace(0.4, 0.6, 30)
+        grown = grow_points(matching, refine_points(matching, curve(s), tangents(curve, s)), 0.2)
+        covered = distances_to(lambda _: grown.points, curve(np.linspace(0, 1, 500)))
+        assert covered.max() < 2 * pixel
+        assert distances_to(curve, grown.points).max() < 2 * pixel
+
+
+def test_growing_asks_for_the_support_it_is_told(taichi, generator):
+    views = views_of([A], generator, hidden=0.7)
+    matching = EdgelMatching(views)
+    start = refine_points(matching, A(np.linspace(0.4, 0.6, 30)), tangents(A, np.linspace(0.4, 0.6, 30)))
+    assert len(grow_points(matching, start, 0.9)) == len(start)
+    assert len(grow_points(matching, start, 0.05)) > len(start)
+
+
+def noisy_means(curves, generator, views, count=300):
+    """Points as training leaves them: half a pixel off, directions 10 degrees off, and some strays."""
+    points, along = zip(*(displaced(curve, count, 0.7 * pixel_of(views), generator) for curve in curves))
+    strays = generator.uniform(0.2, 0.8, (60, 3))
+    means, directions = np.concatenate([*points, strays]), np.concatenate([*along, generator.normal(size=(60, 3))])
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = directions + generator.normal(0, 0.1, means.shape)
+    return means, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def test_filter_refines_keeps_edges_and_drops_strays(taichi, generator):
+    curves = (A, RIM, line([0.3, 0.7, 0.2], [0.3, 0.7, 0.8]))
+    views = views_of(curves, generator, noise_px=0.1, hidden=0.3)
+    means, directions = noisy_means(curves, generator, views)
+    opacities = np.full(len(means), 0.9)
+    opacities[:50] = 0.1
+    config = FilterConfig(refine=True, harvest=False, grow=0.0, outlier_neighbors=0)
+    points, along, steadiness, counts = filter_points(means, directions, opacities, views, config, 0.5, generator)
+    off = np.min([distances_to(curve, points) for curve in curves], axis=0)
+    assert np.median(off) < 0.1 * pixel_of(views) and (off < pixel_of(views)).mean() > 0.99
+    assert len(points) == len(along) == len(steadiness) > 0.9 * (900 - 50)
+    assert counts.gaussians == len(means) and counts.low_opacity == 50
+    assert len(points) == counts.gaussians - counts.low_opacity - counts.low_support - counts.unsteady
+
+
+def test_harvest_finds_an_edge_that_few_views_see(taichi, generator):
+    rare = line([0.3, 0.7, 0.2], [0.3, 0.7, 0.8])
+    views = views_of([A, RIM], generator, noise_px=0.05)
+    few = views_of([rare], generator)
+    joined = []
+    for view in range(len(views)):
+        parts = [views.edgels.of_view(view)] + ([few.edgels.of_view(view)] if view % 5 == 0 else [])
+        joined.append([np.concatenate(arrays) for arrays in zip(*parts)])
+    object.__setattr__(views, "edgels", Edgels.of_views(joined))
+    means, directions = noisy_means((A, RIM), generator, views)
+    found = {}
+    for harvest in (False, True):
+        config = FilterConfig(refine=True, harvest=harvest, outlier_neighbors=0)
+        found[harvest] = filter_points(means, directions, np.ones(len(means)), views, config, 0.5, generator)
+    on_rare = {harvest: (distances_to(rare, result[0]) < pixel_of(views)).sum() for harvest, result in found.items()}
+    assert on_rare[False] == 0 and on_rare[True] > 30
+    assert found[True][3].harvested > 0
+
+
+def test_clusters_that_are_not_steady_are_dropped():
+    labels = np.array([0, 0, 1, 1, 2, -1])
+    kept, dropped = drop_contours(labels, np.array([1.0, 0.8, 0.5, 0.6, 0.9, 0.1]), 0.72)
+    np.testing.assert_array_equal(kept, [0, 0, -1, -1, 1, -1])
+    assert dropped == 1
+    assert drop_contours(np.array([-1, -1]), np.ones(2), 0.72)[1] == 0
