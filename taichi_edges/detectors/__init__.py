@@ -1,4 +1,7 @@
-"""What finds the 2D edges. DETECTORS[name](frames, run) -> frames it used, edge maps (V, H, W) uint8, Edgels or None."""
+"""What finds the 2D edges.
+
+DETECTORS[name](frames, run) gives the frames it could use, edge maps (V, H, W) uint8, and Edgels or None.
+"""
 
 from taichi_edges.errors import UserError
 

@@ -72,7 +72,7 @@ def ridge_points(edge_map, sigma, threshold):
 
 
 def _is_nearest(shape, sharp, rows, columns, du, dv):
-    """(n,) bool: which pixels are the nearest to their ridge, (du, dv) px away; of two that are half-way, one at least."""
+    """(n,) bool: which pixels are the nearest to their ridge, (du, dv) px away; of two half-way, one at least."""
     farthest = np.maximum(np.abs(du), np.abs(dv))
     inside = farthest <= 0.5
     claimed = np.zeros(shape, bool)

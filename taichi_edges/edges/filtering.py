@@ -107,9 +107,8 @@ def judge(matching, refined, config):
     steady, places = supported.copy(), refined.points[supported]
     if len(places):
         around = cKDTree(places).query(places, min(AROUND, len(places)))[1].reshape(len(places), -1)
-        steady[supported] = (
-            np.median(explained.steadiness[supported][around], axis=1) >= LENIENT * config.min_steadiness
-        )
+        typical = np.median(explained.steadiness[supported][around], axis=1)
+        steady[supported] = typical >= LENIENT * config.min_steadiness
     return supported, steady, explained.steadiness
 
 

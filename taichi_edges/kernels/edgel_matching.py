@@ -25,7 +25,8 @@ class EdgelGrid:
     """The edgels of all views in cells of CELL x CELL pixels, for look-ups by kernels.
 
     starts: (V * rows * columns + 1,) int32, where each cell begins in `elements` (n, 4): u, v and the unit normal.
-    strengths: (n,) float32 of the elements. order: (n,) the index in Edgels of each element. rows, columns: cells in a view.
+    strengths: (n,) float32 of the elements. order: (n,) the index in Edgels of each element. rows, columns: cells
+    in a view.
     """
 
     def __init__(self, edgels, height, width):
