@@ -40,12 +40,12 @@ MARGIN = 2  # px at the image's border where no edgel is looked for: as far as a
 MIN_STEP = 1.4
 CLUTTER_SIGMA = 2.0  # px; directions are compared over so much, which is short against the curves of most edges
 CLUTTER_WINDOW = 12.0  # px; the clutter's mean is taken over so much, wide against the neighbourhood of one edge
-BESIDE = 3.5  # blurs of the edge; there its own gradient is nearly gone (0.2 %)
+BESIDE = 3.0  # blurs of the edge; there its own gradient is nearly gone (1 %)
 
 LOW = 1.25  # times the clutter; less is no candidate
 NEEDED = 2.5  # ratio of a maximum that speaks neither for nor against an edge; noise has maxima of 1.5 to 2.5
 MOST = 3.0  # votes of one maximum at most, for or against: reached at 20 times the ratio needed
-ENOUGH = 18.0  # votes for an edge: 6 maxima that are as clear as can be, or 45 of a ratio of 1.5 times what is needed
+ENOUGH = 12.0  # votes for an edge: 4 maxima that are as clear as can be, or 30 of a ratio of 1.5 times what is needed
 WINDOW = 5  # maxima to each side that are asked whether the edge goes on here
 STRAIGHT = 0.9  # mean of the unit normals over the window; a circle with a radius of 7 px has it
 WINDING = 5.0  # votes lost when the mean of the normals falls by 1
@@ -137,7 +137,7 @@ def detect_edgels(image):
     layers = []
     for field in _fields(picture):
         edges, runs = _chained(_maxima(field, _clutter(field)), shape)
-        free = ~_beside_taken(taken, edges, 2 * field.sigma)
+        free = ~_beside_taken(taken, edges, 1.5 * field.sigma)
         layers.append(edges.take(_long_runs(free, runs)))
         taken[layers[-1].rows, layers[-1].columns] = True
     return _arrays(layers)
@@ -207,7 +207,7 @@ def _steepest(gx, gy, mean):
 
 
 def _clutter(field):
-    """(H, W) float32: grey levels per pixel by which the gradient varies along the edges, or by which rounding varies it.
+    """(H, W) float32: grey levels per pixel by which the gradient varies along the edges, or rounding varies it.
 
     That is the root of the smaller eigenvalue of the structure tensor. The mean is geometric: corners count little.
     """
@@ -230,10 +230,12 @@ def _maxima(field, clutter):
     size = np.sqrt(squares[rows, columns])
     normals = np.stack([gx, gy], axis=1) / size[:, None]
     offsets = _offsets(squares, rows, columns, normals)
-    points = np.stack([columns, rows], axis=1) + offsets[:, None] * normals
+    near = np.abs(offsets) < 1
+    rows, columns, size, normals, offsets = (array[near] for array in (rows, columns, size, normals, offsets))
+    points = np.stack([columns, rows], axis=1).astype(np.float32) + offsets[:, None] * normals
     standing_out = size - _beside(field, rows, columns, normals)
     ratios = standing_out * (field.levels / clutter)[rows, columns]
-    return Maxima(rows, columns, points, normals, ratios).take(np.abs(offsets) < 1)
+    return Maxima(rows, columns, points, normals, ratios).take(ratios > LOW)
 
 
 def _candidates(field, squares, clutter):
@@ -275,7 +277,7 @@ def _offsets(squares, rows, columns, normals):
     nx, ny = normals.T
     curvature = xx * nx * nx + 2 * xy * nx * ny + yy * ny * ny
     slope = x * nx + y * ny
-    return np.divide(-slope, curvature, out=np.full(len(rows), np.inf), where=curvature < 0)
+    return np.divide(-slope, curvature, out=np.full(len(rows), np.inf, np.float32), where=curvature < 0)
 
 
 def _beside(field, rows, columns, normals):
@@ -291,6 +293,8 @@ def _beside(field, rows, columns, normals):
 
 def _chained(maxima, shape):
     """The Maxima that are edges, along their chains, ratios averaged there; and (n,) int, the run each belongs to."""
+    if len(maxima) == 0:
+        return maxima, np.zeros(0, np.int64)
     order, low, high = _ordered(*_links(maxima, shape))
     maxima = maxima.take(order)
 
@@ -304,7 +308,7 @@ def _chained(maxima, shape):
     goes_on = mean(votes) > 0
     chain_starts = np.concatenate([[False], low[1:] > high[:-1] - 1])
     runs = np.cumsum(chain_starts | np.concatenate([[False], goes_on[1:] != goes_on[:-1]]))
-    kept = goes_on & (np.bincount(runs, votes)[runs] >= ENOUGH) if len(runs) else goes_on
+    kept = goes_on & (np.bincount(runs, votes)[runs] >= ENOUGH)
     smoothed = Maxima(maxima.rows, maxima.columns, maxima.points, maxima.normals, mean(maxima.ratios))
     return smoothed.take(kept), runs[kept]
 
@@ -318,12 +322,13 @@ def _links(maxima, shape):
     place = np.full(shape, -1, np.int32)
     place[maxima.rows, maxima.columns] = np.arange(count)
     costs, partners = np.full((2, count), np.inf, np.float32), np.full((2, count), -1)
+    columns = [np.ascontiguousarray(column) for column in (*maxima.points.T, *maxima.normals.T)]
     for ring in (NEAR, GAPS):
         lonely = np.flatnonzero((partners < 0).any(axis=0))
         centre = maxima.rows[lonely] * shape[1] + maxima.columns[lonely]
         for down, right in ring:
             others = place.reshape(-1)[centre + down * shape[1] + right]
-            _offer(maxima, lonely[others >= 0], others[others >= 0], costs, partners)
+            _offer(columns, lonely[others >= 0], others[others >= 0], costs, partners)
     ahead, behind = partners
     mutual = (ahead >= 0) & (behind[ahead] == np.arange(count))
     ahead = np.where(mutual, ahead, -1)
@@ -332,14 +337,17 @@ def _links(maxima, shape):
     return ahead, behind
 
 
-def _offer(maxima, ours, others, costs, partners):
-    """Take each of the others for the neighbour of ours where it is better than the one so far; changes both arrays."""
-    ux, uy = maxima.normals[ours].T
-    vx, vy = maxima.normals[others].T
-    x, y = (maxima.points[others] - maxima.points[ours]).T
-    along = ux * y - uy * x
-    aside = np.abs(x * ux + y * uy) + np.abs(x * vx + y * vy)
-    turn = ux * vx + uy * vy
+def _offer(columns, ours, others, costs, partners):
+    """Take each of the others for the neighbour of ours where it is better than the one so far; changes both arrays.
+
+    columns: u, v of the points and of the normals, (n,) each. ours, others: (m,) indices. costs, partners: (2, n), of
+    the best neighbour so far on either side.
+    """
+    (pu, pv, pnu, pnv), (qu, qv, qnu, qnv) = ([column[of] for column in columns] for of in (ours, others))
+    u, v = qu - pu, qv - pv
+    along = pnu * v - pnv * u
+    aside = np.abs(u * pnu + v * pnv) + np.abs(u * qnu + v * qnv)
+    turn = pnu * qnu + pnv * qnv
     cost = aside + np.abs(along) + 1 - turn
     fits = (turn > MAX_TURN) & (aside < 2 * np.abs(along))
     for side, mine in enumerate((along > 0, along < 0)):
@@ -349,11 +357,11 @@ def _offer(maxima, ours, others, costs, partners):
 
 
 def _ordered(ahead, behind):
-    """(n,) the maxima chain by chain, each in order; and (n,) in that order, the window around each: low .. high - 1."""
+    """(n,) the maxima chain by chain, in order; and (n,) for each of them its window, low .. high - 1, in that order."""
     count = len(ahead)
     linked = np.flatnonzero(ahead >= 0)
     graph = coo_array((np.ones(len(linked), bool), (linked, ahead[linked])), shape=(count, count))
-    chains, labels = connected_components(graph, directed=False) if count else (0, np.zeros(0, np.int32))
+    chains, labels = connected_components(graph, directed=False)
     open_chain = np.zeros(chains, bool)
     open_chain[labels[behind < 0]] = True
     first = np.full(chains, count)
@@ -375,7 +383,7 @@ def _beside_taken(taken, maxima, reach):
     """(n,) bool: is one of the pixels across each edge, up to `reach` away, taken? taken: (H, W) bool."""
     height, width = taken.shape
     result = np.zeros(len(maxima), bool)
-    for step in np.arange(-np.ceil(reach), np.ceil(reach) + 1):
+    for step in np.arange(-np.rint(reach), np.rint(reach) + 1):
         columns, rows = np.rint(maxima.points + step * maxima.normals).astype(np.int64).T
         result |= taken[rows.clip(0, height - 1), columns.clip(0, width - 1)]
     return result
