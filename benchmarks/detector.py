@@ -30,6 +30,7 @@ APART = (0.75, 1.25, 1.75)  # px to both sides of an edge: with another edge the
 JITTER = 0.002  # scene units; a sample is seen when a point so near to it is
 STEP = 0.02  # scene units; a jump of the depth from pixel to pixel that is an occluding contour
 NEAR_PX, FAR_PX = 1.0, 3.0  # a true edge is found within NEAR_PX; an edgel farther than FAR_PX from every edge is false
+CLOSE_PX = 0.6  # an offset that counts for the mean shift; larger ones are of another edge
 PARALLEL = np.cos(np.radians(30.0))  # an edgel measures an edge that runs as it does
 
 
@@ -129,67 +130,72 @@ def stands_alone(pixels, normals):
     return alone
 
 
-def measure_view(edgels, truth, image, mesh, lens, pose, map_path):
-    """Columns of one view: see `report`."""
+def truth_in_view(truth, size, mesh, lens, pose, map_path):
+    """Pixels (n, 2) of the visible samples of the true edges, and the unit normals (n, 2) of the edges there."""
     points, tangents = truth
-    height, width = image.shape[:2]
-    alpha = image[:, :, 3] if image.shape[2] == 4 else np.full((height, width), 255, np.uint8)
     pixels, _ = project(points, lens, pose)
     ahead, _ = project(points + 1e-4 * tangents, lens, pose)
-    inside = inside_image(pixels, width, height)
-    centre = -pose[:, :3].T @ pose[:, 3]
-    seen = inside & (seen_on_mesh(mesh, points, centre) if mesh else True)
-    if not mesh:
+    seen = inside_image(pixels, *size)
+    if mesh:
+        seen &= seen_on_mesh(mesh, points, -pose[:, :3].T @ pose[:, 3])
+    else:
         seen[seen] = seen_on_map(map_path, pixels[seen])
-    pixels, along = pixels[seen], (ahead - pixels)[seen]
+    along = (ahead - pixels)[seen]
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    normals = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    found, own_normals, _ = edgels
-    away = cKDTree(found).query(pixels)[0]
-    outlines = (
-        contour_pixels(mesh, lens, pose, (height, width))
-        if mesh
-        else np.argwhere(cv2.morphologyEx(alpha, cv2.MORPH_GRADIENT, np.ones((3, 3))) > 127)[:, ::-1]
-    )
-    to_truth, nearest = cKDTree(pixels).query(found)
-    lost = np.minimum(to_truth, cKDTree(outlines).query(found)[0]) > FAR_PX
-    good = (to_truth < 2.0) & (np.abs((own_normals * normals[nearest]).sum(axis=1)) > PARALLEL)
-    offsets = ((found - pixels[nearest]) * normals[nearest]).sum(axis=1)[good]
-    sides = outline_sides(alpha, pixels, normals)[nearest][good]
+    return pixels[seen], np.stack([-along[:, 1], along[:, 0]], axis=1)
+
+
+def outline_pixels(alpha):
+    """(n, 2) pixels along the outline of the object."""
+    return np.argwhere(cv2.morphologyEx(alpha, cv2.MORPH_GRADIENT, np.ones((3, 3))) > 127)[:, ::-1]
+
+
+def measure_view(edgels, truth, image, mesh, lens, pose, map_path):
+    """Columns of one view, as `report` wants them: of the true points, of all edgels, of those near a true edge."""
+    height, width = image.shape[:2]
+    alpha = image[:, :, 3]
+    pixels, normals = truth_in_view(truth, (width, height), mesh, lens, pose, map_path)
+    sides = outline_sides(alpha, pixels, normals)
     alone = stands_alone(pixels, normals)
-    crease = alone & (outline_sides(alpha, pixels, normals) == 0)
+    points, directions, _ = edgels
+    contours = contour_pixels(mesh, lens, pose, (height, width)) if mesh else outline_pixels(alpha)
+    to_truth, nearest = cKDTree(pixels).query(points)
+    cosines = np.abs((directions * normals[nearest]).sum(axis=1))
+    good = (to_truth < 2.0) & (cosines > PARALLEL)
     return dict(
-        away=away,
+        away=cKDTree(points).query(pixels)[0],
         alone=alone,
-        crease=crease,
-        lost=lost,
-        offsets=offsets,
+        crease=alone & (sides == 0),
+        lost=np.minimum(to_truth, cKDTree(contours).query(points)[0]) > FAR_PX,
+        offsets=((points - pixels[nearest]) * normals[nearest]).sum(axis=1)[good],
         normals=normals[nearest][good],
-        sides=sides,
-        own=own_normals[good],
-        length=len(found),
+        sides=sides[nearest][good],
+        angles=np.degrees(np.arccos(cosines[good].clip(max=1))),
+        length=len(points),
     )
 
 
 def report(name, rows):
-    """One line of Markdown for a scene."""
+    """Print one line of Markdown for a scene, from what `measure_view` found in its views."""
     column = {key: np.concatenate([np.atleast_1d(row[key]) for row in rows]) for key in rows[0]}
     away, offsets, sides, normals = (column[key] for key in ("away", "offsets", "sides", "normals"))
-    good = np.abs(offsets) < 0.6
+    close = np.abs(offsets) < CLOSE_PX
     # The one shift (dx, dy) of all edgels that explains the offsets along the normals best.
-    shift = np.linalg.lstsq(normals[good], offsets[good], rcond=None)[0]
-    outward = np.median((offsets * sides)[(sides != 0) & good])
-    crease, alone = column["crease"], column["alone"]
-    errors = np.abs(offsets)
-    angle = np.degrees(np.arccos(np.clip(np.abs((column["own"] * normals).sum(axis=1))[good], 0, 1)))
-    print(
-        f"| {name} | {np.median(errors):.3f} / {np.quantile(errors, 0.95):.2f} | {shift[0]:+.3f}, {shift[1]:+.3f} "
-        f"| {outward:+.3f} | {np.mean(away < NEAR_PX):.1%} / {np.mean(away < FAR_PX):.1%} "
-        f"| {np.mean(away[alone] < NEAR_PX):.1%} / {np.mean(away[alone] < FAR_PX):.1%} "
-        f"| {np.mean(away[crease] < NEAR_PX):.1%} / {np.mean(away[crease] < FAR_PX):.1%} "
-        f"| {column['lost'].mean():.1%} | {np.median(angle):.1f} | {column['length'].mean():.0f} |",
-        flush=True,
-    )
+    shift = np.linalg.lstsq(normals[close], offsets[close], rcond=None)[0]
+    outward = np.median((offsets * sides)[(sides != 0) & close])
+    chosen = (away, away[column["alone"]], away[column["crease"]])
+    recalls = [f"{np.mean(some < NEAR_PX):.1%} / {np.mean(some < FAR_PX):.1%}" for some in chosen]
+    cells = [
+        name,
+        f"{np.median(np.abs(offsets)):.3f} / {np.quantile(np.abs(offsets), 0.95):.2f}",
+        f"{shift[0]:+.3f}, {shift[1]:+.3f}",
+        f"{outward:+.3f}",
+        *recalls,
+        f"{column['lost'].mean():.1%}",
+        f"{np.median(column['angles']):.1f}",
+        f"{column['length'].mean():.0f}",
+    ]
+    print(f"| {' | '.join(cells)} |", flush=True)
 
 
 SCENES = {

@@ -42,7 +42,7 @@ CLUTTER_SIGMA = 2.0  # px; directions are compared over so much, which is short 
 CLUTTER_WINDOW = 12.0  # px; the clutter's mean is taken over so much, wide against the neighbourhood of one edge
 BESIDE = 3.0  # blurs of the edge; there its own gradient is nearly gone (1 %)
 
-LOW = 1.25  # times the clutter; less is no candidate
+LOW = 1.6  # times the clutter; less is no candidate
 NEEDED = 2.5  # ratio of a maximum that speaks neither for nor against an edge; noise has maxima of 1.5 to 2.5
 MOST = 3.0  # votes of one maximum at most, for or against: reached at 20 times the ratio needed
 ENOUGH = 15.0  # votes for an edge: 5 maxima that are as clear as can be, or 37 of a ratio of 1.5 times what is needed
