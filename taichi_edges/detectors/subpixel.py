@@ -2,7 +2,7 @@
 
 For each scale, the fine ones first:
 
-1. The gradient of the light, of that of three opponent colours which is steepest: an edge between equally bright
+1. The gradient of the light, in that of three opponent colours in which it is steepest: an edge between equally bright
    colours counts like any other. The outline of a picture with transparency is a layer of its own.
 2. The clutter around each pixel: how much the gradient varies in the direction along an edge. A straight edge, or a
    grid of them, has none; noise and texture vary in all directions alike.
@@ -29,9 +29,9 @@ from taichi_edges.detectors.pictures import Picture, as_picture, levels_per_ligh
 from taichi_edges.detectors.ridges import gaussian_derivatives
 from taichi_edges.edgels import Edgels
 
-# px, smoothing. The first is about the smallest whose derivative is sampled well: it keeps edges 2 px apart separate
-# and moves a rim of radius r by 0.25 / r px only. Noise of the gradient falls with the square of the scale.
-SCALES = (0.7, 1.5)
+# px, smoothing. The first is about the smallest whose derivative is sampled well; it keeps edges 2 px apart separate.
+# The noise of the gradient falls with the square of the scale.
+SCALES = (0.8, 1.5)
 PIXEL_SIGMA = 0.3  # px; a pixel sees the mean over its area, which blurs like a Gaussian of sqrt(1 / 12)
 MIN_COVERAGE = 0.5  # of a smoothed pixel by the object; the object's colour is not looked at farther out
 MARGIN = 2  # px at the image's border where no edgel is looked for: as far as a link reaches
@@ -40,16 +40,18 @@ MARGIN = 2  # px at the image's border where no edgel is looked for: as far as a
 MIN_STEP = 1.4
 CLUTTER_SIGMA = 2.0  # px; directions are compared over so much, which is short against the curves of most edges
 CLUTTER_WINDOW = 12.0  # px; the clutter's mean is taken over so much, wide against the neighbourhood of one edge
-BESIDE = 3.5  # blurs of the edge; there its own gradient is nearly gone (0.2 %)
+BESIDE = 3.0  # blurs of the edge; there its own gradient is nearly gone (1 %)
 
-LOW = 1.25  # times the clutter; less is no candidate
+LOW = 1.6  # times the clutter; less is no candidate
 NEEDED = 2.5  # ratio of a maximum that speaks neither for nor against an edge; noise has maxima of 1.5 to 2.5
 MOST = 3.0  # votes of one maximum at most, for or against: reached at 20 times the ratio needed
-ENOUGH = 18.0  # votes for an edge: 6 maxima that are as clear as can be, or 45 of a ratio of 1.5 times what is needed
+ENOUGH = 15.0  # votes for an edge: 5 maxima that are as clear as can be, or 37 of a ratio of 1.5 times what is needed
 WINDOW = 5  # maxima to each side that are asked whether the edge goes on here
 STRAIGHT = 0.9  # mean of the unit normals over the window; a circle with a radius of 7 px has it
 WINDING = 5.0  # votes lost when the mean of the normals falls by 1
 MAX_TURN = np.cos(np.radians(50.0))  # from one maximum to the next of a chain
+MIN_CHORD = 3.0  # px; of nearer ends the directions say little about the curvature
+MAX_CURVATURE = 0.25  # 1 / px; a corner is no circle of a smaller radius
 MIN_RUN = 5  # maxima; what remains of a coarse chain beside finer ones must be longer
 HALF_SURE = 12.0  # ratio of an edge that gets the strength 0.5
 
@@ -130,7 +132,7 @@ def trace_pictures(paths, threads=None, report=None, exponent=None):
 def detect_edgels(image):
     """Edgels of one image: a Picture, or an array that `as_picture` accepts.
 
-    Returns points (n, 2) as (u, v), pixel centres at integers, about one for each pixel of an edge's length; unit
+    Returns points (n, 2) as (u, v), pixel centres at integers, 0.7 to 1.4 for each pixel of an edge's length; unit
     normals (n, 2) across the edge, towards more light; strengths (n,) in 0..1: r / (r + HALF_SURE) for an edge that
     stands out r times from the clutter around it. The faintest have about 0.2, and clear ones more than 0.5.
     """
@@ -141,8 +143,8 @@ def detect_edgels(image):
     taken = np.zeros(shape, bool)  # pixels with an edgel
     layers = []
     for field in _fields(picture):
-        edges, runs = _chained(_maxima(field, _clutter(field)), shape)
-        free = ~_beside_taken(taken, edges, 2 * field.sigma)
+        edges, runs = _chained(_maxima(field, _clutter(field)), shape, field.blur)
+        free = ~_beside_taken(taken, edges, 1.5 * field.sigma)
         layers.append(edges.take(_long_runs(free, runs)))
         taken[layers[-1].rows, layers[-1].columns] = True
     return _arrays(layers)
@@ -212,7 +214,7 @@ def _steepest(gx, gy, mean):
 
 
 def _clutter(field):
-    """(H, W) float32: grey levels per pixel by which the gradient varies along the edges, or by which rounding varies it.
+    """(H, W) float32: grey levels per pixel by which the gradient varies along the edges, or rounding varies it.
 
     That is the root of the smaller eigenvalue of the structure tensor. The mean is geometric: corners count little.
     """
@@ -235,10 +237,12 @@ def _maxima(field, clutter):
     size = np.sqrt(squares[rows, columns])
     normals = np.stack([gx, gy], axis=1) / size[:, None]
     offsets = _offsets(squares, rows, columns, normals)
-    points = np.stack([columns, rows], axis=1) + offsets[:, None] * normals
+    near = np.abs(offsets) < 1
+    rows, columns, size, normals, offsets = (array[near] for array in (rows, columns, size, normals, offsets))
+    points = np.stack([columns, rows], axis=1).astype(np.float32) + offsets[:, None] * normals
     standing_out = size - _beside(field, rows, columns, normals)
     ratios = standing_out * (field.levels / clutter)[rows, columns]
-    return Maxima(rows, columns, points, normals, ratios).take(np.abs(offsets) < 1)
+    return Maxima(rows, columns, points, normals, ratios).take(ratios > LOW)
 
 
 def _candidates(field, squares, clutter):
@@ -280,7 +284,7 @@ def _offsets(squares, rows, columns, normals):
     nx, ny = normals.T
     curvature = xx * nx * nx + 2 * xy * nx * ny + yy * ny * ny
     slope = x * nx + y * ny
-    return np.divide(-slope, curvature, out=np.full(len(rows), np.inf), where=curvature < 0)
+    return np.divide(-slope, curvature, out=np.full(len(rows), np.inf, np.float32), where=curvature < 0)
 
 
 def _beside(field, rows, columns, normals):
@@ -294,8 +298,13 @@ def _beside(field, rows, columns, normals):
     return total / 2
 
 
-def _chained(maxima, shape):
-    """The Maxima that are edges, along their chains, ratios averaged there; and (n,) int, the run each belongs to."""
+def _chained(maxima, shape, blur):
+    """The Maxima that are edges, along their chains, ratios averaged there; and (n,) int, the run each belongs to.
+
+    Where the edge is curved, blurring by `blur` pixels moved it inwards by half of blur^2 / radius; it is moved back.
+    """
+    if len(maxima) == 0:
+        return maxima, np.zeros(0, np.int64)
     order, low, high = _ordered(*_links(maxima, shape))
     maxima = maxima.take(order)
 
@@ -309,9 +318,23 @@ def _chained(maxima, shape):
     goes_on = mean(votes) > 0
     chain_starts = np.concatenate([[False], low[1:] > high[:-1] - 1])
     runs = np.cumsum(chain_starts | np.concatenate([[False], goes_on[1:] != goes_on[:-1]]))
-    kept = goes_on & (np.bincount(runs, votes)[runs] >= ENOUGH) if len(runs) else goes_on
-    smoothed = Maxima(maxima.rows, maxima.columns, maxima.points, maxima.normals, mean(maxima.ratios))
+    kept = goes_on & (np.bincount(runs, votes)[runs] >= ENOUGH)
+    shifts = 0.5 * blur**2 * _curvatures(maxima, low, high - 1)
+    points = maxima.points + shifts[:, None] * maxima.normals
+    smoothed = Maxima(maxima.rows, maxima.columns, points, maxima.normals, mean(maxima.ratios))
     return smoothed.take(kept), runs[kept]
+
+
+def _curvatures(maxima, first, last):
+    """(n,) 1 / pixels, positive where the normals point away from the centre: from the two ends of each window.
+
+    On a circle the normals differ by the chord over the radius, however long it is.
+    """
+    chords = maxima.points[last] - maxima.points[first]
+    turns = maxima.normals[last] - maxima.normals[first]
+    squares = (chords**2).sum(axis=1)
+    curvatures = (chords * turns).sum(axis=1) / np.maximum(squares, 1.0)
+    return np.where(squares > MIN_CHORD**2, curvatures, 0.0).clip(-MAX_CURVATURE, MAX_CURVATURE)
 
 
 def _links(maxima, shape):
@@ -323,12 +346,13 @@ def _links(maxima, shape):
     place = np.full(shape, -1, np.int32)
     place[maxima.rows, maxima.columns] = np.arange(count)
     costs, partners = np.full((2, count), np.inf, np.float32), np.full((2, count), -1)
+    columns = [np.ascontiguousarray(column) for column in (*maxima.points.T, *maxima.normals.T)]
     for ring in (NEAR, GAPS):
         lonely = np.flatnonzero((partners < 0).any(axis=0))
         centre = maxima.rows[lonely] * shape[1] + maxima.columns[lonely]
         for down, right in ring:
             others = place.reshape(-1)[centre + down * shape[1] + right]
-            _offer(maxima, lonely[others >= 0], others[others >= 0], costs, partners)
+            _offer(columns, lonely[others >= 0], others[others >= 0], costs, partners)
     ahead, behind = partners
     mutual = (ahead >= 0) & (behind[ahead] == np.arange(count))
     ahead = np.where(mutual, ahead, -1)
@@ -337,14 +361,17 @@ def _links(maxima, shape):
     return ahead, behind
 
 
-def _offer(maxima, ours, others, costs, partners):
-    """Take each of the others for the neighbour of ours where it is better than the one so far; changes both arrays."""
-    ux, uy = maxima.normals[ours].T
-    vx, vy = maxima.normals[others].T
-    x, y = (maxima.points[others] - maxima.points[ours]).T
-    along = ux * y - uy * x
-    aside = np.abs(x * ux + y * uy) + np.abs(x * vx + y * vy)
-    turn = ux * vx + uy * vy
+def _offer(columns, ours, others, costs, partners):
+    """Take each of the others for the neighbour of ours where it is better than the one so far; changes both arrays.
+
+    columns: u, v of the points and of the normals, (n,) each. ours, others: (m,) indices. costs, partners: (2, n), of
+    the best neighbour so far on either side.
+    """
+    (pu, pv, pnu, pnv), (qu, qv, qnu, qnv) = ([column[of] for column in columns] for of in (ours, others))
+    u, v = qu - pu, qv - pv
+    along = pnu * v - pnv * u
+    aside = np.abs(u * pnu + v * pnv) + np.abs(u * qnu + v * qnv)
+    turn = pnu * qnu + pnv * qnv
     cost = aside + np.abs(along) + 1 - turn
     fits = (turn > MAX_TURN) & (aside < 2 * np.abs(along))
     for side, mine in enumerate((along > 0, along < 0)):
@@ -354,11 +381,11 @@ def _offer(maxima, ours, others, costs, partners):
 
 
 def _ordered(ahead, behind):
-    """(n,) the maxima chain by chain, each in order; and (n,) in that order, the window around each: low .. high - 1."""
+    """(n,) the maxima chain by chain, in order; and, in that order, (n,) the window of each, low .. high - 1."""
     count = len(ahead)
     linked = np.flatnonzero(ahead >= 0)
     graph = coo_array((np.ones(len(linked), bool), (linked, ahead[linked])), shape=(count, count))
-    chains, labels = connected_components(graph, directed=False) if count else (0, np.zeros(0, np.int32))
+    chains, labels = connected_components(graph, directed=False)
     open_chain = np.zeros(chains, bool)
     open_chain[labels[behind < 0]] = True
     first = np.full(chains, count)
@@ -380,7 +407,7 @@ def _beside_taken(taken, maxima, reach):
     """(n,) bool: is one of the pixels across each edge, up to `reach` away, taken? taken: (H, W) bool."""
     height, width = taken.shape
     result = np.zeros(len(maxima), bool)
-    for step in np.arange(-np.ceil(reach), np.ceil(reach) + 1):
+    for step in np.arange(-np.rint(reach), np.rint(reach) + 1):
         columns, rows = np.rint(maxima.points + step * maxima.normals).astype(np.int64).T
         result |= taken[rows.clip(0, height - 1), columns.clip(0, width - 1)]
     return result
