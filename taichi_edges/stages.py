@@ -57,14 +57,16 @@ def _finish_views(run, views):
     return {**facts, "files": [_write_sheet(run, views, residuals), *_copy_points(run)]}
 
 
-def _traced_in_pictures(run, views):
-    """The views with edgels of their own pictures, and maps drawn through these."""
-    from taichi_edges.detectors.drawing import draw_edge_maps
-    from taichi_edges.detectors.subpixel import trace_pictures
+def _detected_in_pictures(run, views):
+    """The views with what a detector finds in their own pictures in place of the maps that came with them."""
+    from taichi_edges.detectors import DETECTORS
+    from taichi_edges.readers.frames import Frames
 
-    with run.progress.track("detect", len(views)) as report:
-        edgels, _ = trace_pictures(with_whole_paths(run, views).image_paths, run.threads, report)
-    return replace(views, edgels=edgels, edge_maps=draw_edge_maps(edgels, views.height, views.width, run.threads))
+    paths = with_whole_paths(run, views).image_paths
+    cameras = list(views.intrinsics), list(views.world_to_camera)
+    frames = Frames(run.path("images"), list(views.names), [""] * len(views), list(paths), *cameras, opengl=False)
+    _, edge_maps, edgels = DETECTORS[run.config.source.detector](frames, run)
+    return replace(views, edge_maps=edge_maps, edgels=edgels)
 
 
 def with_whole_paths(run, views):
@@ -161,8 +163,9 @@ def _prepare_synthetic(run):
         with replacing(run.path(file)) as unfinished:
             unfinished.write_bytes(cv2.imencode(".png", picture[:, :, ::-1])[1])
     views = replace(views, image_paths=tuple(files))
-    if source.detector == "subpixel":
-        views = _traced_in_pictures(run, views)
+    if source.detector in ("subpixel", "onnx"):
+        views = _detected_in_pictures(run, views)
+    write_edges(run.path("truth.json"), part.edges, {"part": part.name})
     facts = _finish_views(run, views)
     return {"part": part.name, **facts, "files": ["truth.json", *files, *facts["files"]]}
 
