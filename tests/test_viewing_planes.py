@@ -206,7 +206,7 @@ def test_half_an_edge_grows_to_its_ends_and_not_beyond(taichi, generator):
         views = views_of([curve], generator, noise_px=0.05)
         matching, pixel = EdgelMatching(views), pixel_of(views)
         s = np.linspace(0.4, 0.6, 30)
-        grown = grow_points(matching, refine_points(matching, curve(s), tangents(curve, s)), 0.2)
+        grown = grow_points(matching, refine_points(matching, curve(s), tangents(curve, s)), np.full(30, 0.2))
         covered = distances_to(lambda _: grown.points, curve(np.linspace(0, 1, 500)))
         assert covered.max() < 2 * pixel
         assert distances_to(curve, grown.points).max() < 2 * pixel
@@ -216,8 +216,8 @@ def test_growing_asks_for_the_support_it_is_told(taichi, generator):
     views = views_of([A], generator, hidden=0.7)
     matching = EdgelMatching(views)
     start = refine_points(matching, A(np.linspace(0.4, 0.6, 30)), tangents(A, np.linspace(0.4, 0.6, 30)))
-    assert len(grow_points(matching, start, 0.9)) == len(start)
-    assert len(grow_points(matching, start, 0.05)) > len(start)
+    assert len(grow_points(matching, start, np.full(30, 0.9))) == len(start)
+    assert len(grow_points(matching, start, np.full(30, 0.05))) > len(start)
 
 
 def noisy_means(curves, generator, views, count=300):

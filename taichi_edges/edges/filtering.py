@@ -15,6 +15,7 @@ from taichi_edges.support import exclusive_support
 AROUND = 9  # points, itself included, over which the steadiness of a point is a median
 LEAST_VIEWS = 2.5  # of full strength; two planes always meet, and a third one is there by chance too easily
 LENIENT = 0.75  # of the least steadiness, for a point
+RARE = 0.8  # of a harvested point's support, which those that continue it need
 HARVEST_KEEP = 0.06  # share of the views that must see one of the edges left over
 
 
@@ -84,7 +85,9 @@ def refined_points(points, directions, views, config, edge_threshold, generator)
         refined = refined.joined(harvest(matching, found.keep(supported), views, config, edge_threshold, generator))
     sizes.append(len(refined))
     if config.grow:
-        refined = grow_points(matching, refined, config.grow)
+        least = np.full(len(refined), config.grow)
+        least[sizes[2] :] = np.minimum(config.grow, RARE * refined.support[sizes[2] :])  # what was harvested is rare
+        refined = grow_points(matching, refined, least)
     supported, steady, steadiness = judge(matching, refined, config)
     sizes += [len(refined), supported.sum(), steady.sum()]
     weak, unsteady, harvested, grown, weak_later, unsteady_later = np.abs(np.diff(sizes)).tolist()

@@ -13,45 +13,45 @@ RADII_PX = (1.5, 1.0, 1.0)  # of the refinement of a step
 COVERED, TOO_CLOSE = 0.6, 0.5  # steps; no proposal is made, and no point kept, so near to one that is there
 STRAYED = 0.7  # steps; a point that the refinement moves farther has jumped to something else
 LEAST_COSINE = 0.8  # between the directions before and after a step
-LEAST_VIEWS = 3.0  # a place is where three planes meet, or it is anywhere
+LEAST_VIEWS = 2.5  # of full strength; two planes always meet
 MOST_ROUNDS = 200
 
 
-def grow_points(matching, refined, least_support):
+def grow_points(matching, refined, least):
     """RefinedPoints and the points that continue them, each the step after another.
 
-    matching: EdgelMatching. least_support: share of the views that a new point needs.
+    matching: EdgelMatching. least: (n,) share of the views that the points which continue each of them need.
     """
     step, newest = STEP_PX * matching.pixel, refined
     for _ in range(MOST_ROUNDS):
         if len(newest) == 0:
             break
         tree = cKDTree(refined.points)
-        newest = _next_points(matching, newest, tree, step, least_support)
+        newest, least = _next_points(matching, newest, tree, step, least)
         refined = refined.joined(newest)
     return refined
 
 
-def _next_points(matching, newest, tree, step, least_support):
-    """The refined points one step on from the `newest` ones, both ways, where there is nothing yet."""
+def _next_points(matching, newest, tree, step, least):
+    """The refined points one step on from the `newest` ones, both ways, where there is nothing yet; and their `least`."""
     ahead = np.concatenate([newest.points + step * newest.directions, newest.points - step * newest.directions])
-    directions = np.tile(newest.directions, (2, 1))
-    free = tree.query(ahead)[0] > COVERED * step
-    ahead, directions = _one_for_each_cell(ahead[free], directions[free], TOO_CLOSE * step)
+    free = np.flatnonzero(tree.query(ahead)[0] > COVERED * step)
+    free = free[_one_for_each_cell(ahead[free], TOO_CLOSE * step)]
+    before = free % len(newest)
+    ahead, directions, least = ahead[free], newest.directions[before], least[before]
     found = refine_points(matching, ahead, directions, RADII_PX)
-    good = (found.support >= least_support) & (found.views >= LEAST_VIEWS)
+    good = (found.support >= least) & (found.views >= LEAST_VIEWS)
     good &= np.linalg.norm(found.points - ahead, axis=1) <= STRAYED * step
     good &= np.abs((found.directions * directions).sum(axis=1)) >= LEAST_COSINE
     good[good] = tree.query(found.points[good])[0] > TOO_CLOSE * step
-    found = found.keep(good)
-    return found.keep(_best_apart(found, TOO_CLOSE * step))
+    good[good] = _best_apart(found.keep(good), TOO_CLOSE * step)
+    return found.keep(good), least[good]
 
 
-def _one_for_each_cell(points, directions, size):
-    """The first of the points in each cubic cell, with its direction."""
+def _one_for_each_cell(points, size):
+    """Indices of the first of the points in each cubic cell."""
     cells = np.floor(points / size).astype(np.int64)
-    first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
-    return points[first], directions[first]
+    return np.sort(np.unique(cells, axis=0, return_index=True)[1])
 
 
 def _best_apart(found, distance):
