@@ -43,6 +43,9 @@ class SourceConfig(Section):
     detector: Literal["auto", "maps", "subpixel", "onnx"] = Field(
         "auto", description="ready maps, our own detector, or a network; auto: maps if `edges` is given, else subpixel"
     )
+    gamma: NotNegative = Field(
+        0.0, description="how images encode light, for `subpixel`: value = light^(1/gamma); 0: sRGB, as PNG and JPEG do"
+    )
     onnx: OnnxConfig = Field(default_factory=lambda: OnnxConfig())
     split: str = Field("train", description="nerf: which transforms_<split>.json")
     axes: Literal["auto", "opengl", "opencv"] = Field("auto", description="camera axes; auto: what the layout means")

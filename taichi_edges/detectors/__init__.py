@@ -28,7 +28,7 @@ def detect_subpixel(frames, run):
 
     frames = frames_with_images(frames, run.progress)
     with run.progress.track("detect", len(frames.names)) as report:
-        edgels, sizes = trace_pictures(frames.image_paths, run.threads, report)
+        edgels, sizes = trace_pictures(frames.image_paths, run.threads, report, run.config.source.gamma or None)
     check_sizes(frames, sizes, "colour image")
     if len(edgels) == 0:
         raise UserError(f"{frames.where}: no edge found in any of {len(frames.names)} images; check source.images")

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 from taichi_edges.cameras import project
+from taichi_edges.detectors.pictures import light_of_srgb, srgb_of_light
 from taichi_edges.synthetic.drawing import Imperfections, draw_edge_map
 from taichi_edges.synthetic.visibility import ray_scene, sample_contours, sample_edges, visible_from
 from taichi_edges.views import Views
@@ -104,7 +105,7 @@ def render_pictures(part, intrinsics, world_to_camera, image_size):
 
 
 def render_picture(part, scene, lens, pose, image_size):
-    """(H, W, 3) uint8 RGB: one shaded picture on white."""
+    """(H, W, 3) uint8 RGB: one shaded picture on white. A pixel holds the mean light over its area, as a camera's does."""
     fine = image_size * SUPERSAMPLING
     steps = (np.arange(fine, dtype=np.float32) + 0.5) / SUPERSAMPLING - 0.5  # pixel centres at integers
     columns, rows = np.meshgrid(steps, steps)
@@ -118,9 +119,9 @@ def render_picture(part, scene, lens, pose, image_size):
     heights = rays[hit, 2] + depths[hit] * rays[hit, 5]
     colours = np.ones((fine * fine, 3), np.float32)
     normals = interpolated_normals(part, hits["primitive_ids"].numpy()[hit], hits["primitive_uvs"].numpy()[hit])
-    colours[hit] = shade(normals, heights)
+    colours[hit] = light_of_srgb(shade(normals, heights))
     picture = cv2.resize(colours.reshape(fine, fine, 3), (image_size, image_size), interpolation=cv2.INTER_AREA)
-    return np.rint(255.0 * picture).astype(np.uint8)
+    return np.rint(255.0 * srgb_of_light(picture)).astype(np.uint8)
 
 
 def interpolated_normals(part, triangles, barycentric):
