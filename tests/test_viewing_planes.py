@@ -132,6 +132,23 @@ def test_matching_does_not_depend_on_threads(start_taichi, generator):
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.parametrize("arch", ["vulkan", "cuda"])
+def test_a_gpu_matches_as_the_cpu_does(start_taichi, generator, arch):
+    views = views_of([A, RIM], generator, noise_px=0.3, count=6)
+    points, along = displaced(RIM, 100, pixel_of(views), generator)
+    found = {}
+    for device in ("cpu", arch):
+        start_taichi("f32", 1, device)
+        matching = EdgelMatching(views)
+        found[device] = matching.equations(points, along, 2.0, 0.5), *matching.matches(points, along, slice(0, 6), 2.0)
+    same = found["cpu"][1] == found[arch][1]
+    assert same.mean() > 0.99  # where two edgels are equally near, rounding decides
+    np.testing.assert_array_equal(found["cpu"][3], found[arch][3])
+    np.testing.assert_allclose(found["cpu"][2][same], found[arch][2][same], atol=1e-3)
+    whole = same.all(axis=1)
+    np.testing.assert_allclose(found["cpu"][0][whole], found[arch][0][whole], rtol=1e-2, atol=1.0)
+
+
 def test_matches_are_the_nearest_edgels_brute_force(taichi, generator):
     views = views_of([A, RIM], generator, noise_px=1.0, count=4)
     points, along = displaced(A, 60, 3 * pixel_of(views), generator)

@@ -33,7 +33,7 @@ def grow_points(matching, refined, least):
 
 
 def _next_points(matching, newest, tree, step, least):
-    """The refined points one step on from the `newest` ones, both ways, where there is nothing yet; and their `least`."""
+    """The refined points one step on from the `newest` ones, both ways, where nothing is yet; and their `least`."""
     ahead = np.concatenate([newest.points + step * newest.directions, newest.points - step * newest.directions])
     free = np.flatnonzero(tree.query(ahead)[0] > COVERED * step)
     free = free[_one_for_each_cell(ahead[free], TOO_CLOSE * step)]

@@ -314,7 +314,7 @@ HEADINGS = {
     _whole_edgels: ("edgels", "framed: the part that is magnified"),
     _magnified_edgels: ("edgels, magnified", None),
     _magnified_residuals: ("residuals, magnified", None),
-    _histograms: ("residuals", "red: median; last bars: and beyond"),
+    _histograms: ("residuals", "outwards positive; red: median"),
 }
 
 

@@ -105,7 +105,7 @@ def render_pictures(part, intrinsics, world_to_camera, image_size):
 
 
 def render_picture(part, scene, lens, pose, image_size):
-    """(H, W, 3) uint8 RGB: one shaded picture on white. A pixel holds the mean light over its area, as a camera's does."""
+    """(H, W, 3) uint8 RGB: one shaded picture on white. A pixel holds the mean light over its area, as in a camera."""
     fine = image_size * SUPERSAMPLING
     steps = (np.arange(fine, dtype=np.float32) + 0.5) / SUPERSAMPLING - 0.5  # pixel centres at integers
     columns, rows = np.meshgrid(steps, steps)

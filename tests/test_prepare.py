@@ -1,0 +1,200 @@
+"""The prepare stage: which detector sees what, what is calibrated, and how mistakes are named."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from test_onnx import grey_kernel, node, write_network
+
+from taichi_edges import stages
+from taichi_edges.cameras import invert_pose
+from taichi_edges.errors import UserError
+from taichi_edges.pipeline import Run
+from taichi_edges.progress import Progress
+from taichi_edges.scene_file import check_scene
+from taichi_edges.synthetic.drawing import Imperfections
+from taichi_edges.synthetic.parts import PARTS
+from taichi_edges.synthetic.rendering import render_views
+from taichi_edges.views import read_views
+
+VIEWS, SIZE = 6, 160
+SIDES = np.array([[-1.0, 0, 1], [-2, 0, 2], [-1, 0, 1]]) / 20  # logits from grey levels: vertical edges
+
+
+class Warnings(Progress):
+    """Keeps the warnings."""
+
+    def __init__(self):
+        self.texts = []
+
+    def warn(self, text):
+        self.texts.append(text)
+
+
+@pytest.fixture(scope="module")
+def rendered():
+    """Views of the block with clean edge maps, and pictures."""
+    return render_views(PARTS["block"](), VIEWS, SIZE, Imperfections.none(), np.random.default_rng(0))
+
+
+@pytest.fixture
+def folder(tmp_path, rendered):
+    """An EMAP folder with colour images and edge maps."""
+    views, pictures = rendered
+    frames = []
+    for directory in ("color", "edge_test"):
+        (tmp_path / "data" / directory).mkdir(parents=True)
+    for view, picture in enumerate(pictures):
+        cv2.imwrite(str(tmp_path / "data" / "color" / f"v{view}.png"), picture[:, :, ::-1])
+        cv2.imwrite(str(tmp_path / "data" / "edge_test" / f"v{view}.png"), views.edge_maps[view])
+        pose = np.eye(4)
+        pose[:3] = invert_pose(views.world_to_camera[view])
+        frames.append(
+            {"rgb_path": f"v{view}.png", "camtoworld": pose.tolist(), "intrinsics": views.intrinsics[view].tolist()}
+        )
+    (tmp_path / "data" / "meta_data.json").write_text(json.dumps({"frames": frames}))
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def prepare(tmp_path, folder):
+    """prepare(source, **scene) -> (facts, views, warnings) of the folder's scene."""
+
+    def run_prepare(source=None, **scene):
+        source = {"reader": "emap", "path": str(folder), **(source or {})}
+        config = check_scene({"name": "test", "source": source, **scene}, Path("test.yaml"))
+        (tmp_path / "run").mkdir(exist_ok=True)
+        run = Run(config, tmp_path / "run", threads=2, progress=Warnings())
+        facts = stages.prepare(run)
+        return facts, read_views(run.path("views.npz")), run.progress.texts
+
+    return run_prepare
+
+
+def refusal(prepare, *arguments, **options):
+    with pytest.raises(UserError) as refused:
+        prepare(*arguments, **options)
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
+
+
+def test_images_alone_are_enough(prepare, tmp_path, rendered):
+    facts, views, _ = prepare()
+    assert facts["detector"] == "subpixel" and "calibration" not in facts
+    assert facts["edgels"] == len(views.edgels) > 100 * VIEWS
+    assert (tmp_path / "run" / "detection.png").is_file() and "detection.png" in facts["files"]
+    truth = rendered[0]
+    for view in range(VIEWS):  # where the true maps have lines, to a pixel
+        near = cv2.dilate((truth.edge_maps[view] >= 128).astype(np.uint8), np.ones((3, 3)))
+        places = np.rint(views.edgels.of_view(view)[0]).astype(int)
+        assert near[places[:, 1], places[:, 0]].mean() > 0.85  # steps of rounding in smooth shading look like faint edges
+        assert (views.edge_maps[view] >= 128).any()
+
+
+def test_named_edge_maps_go_before_images(prepare):
+    facts, views, _ = prepare({"edges": "edge_test"})
+    assert facts["detector"] == "maps" and facts["line_width_px"] > 1
+    assert prepare({"edges": "edge_test", "detector": "subpixel"})[0]["detector"] == "subpixel"
+
+
+def test_a_view_without_its_image_is_named_and_left_out(prepare, folder):
+    (folder / "color" / "v2.png").unlink()
+    whole = (folder / "color" / "v4.png").read_bytes()
+    (folder / "color" / "v4.png").write_bytes(whole[: len(whole) // 2])
+    facts, views, warnings = prepare()
+    assert facts["views"] == VIEWS - 2 and "v2" not in views.names and "v4" not in views.names
+    assert any("2 of 6 views left out" in text and "v2, v4" in text for text in warnings)
+
+
+def test_without_images_or_maps_there_is_one_line(prepare, folder):
+    shutil.rmtree(folder / "color")
+    message = refusal(prepare)
+    assert "set source.edges" in message and "edge_test" in message
+    assert "set source.images" in refusal(prepare, {"detector": "subpixel"})
+    assert "no colour image found here; check source.images" in refusal(prepare, {"images": "colours"})
+
+
+def test_images_of_two_sizes_are_refused(prepare, folder):
+    cv2.imwrite(str(folder / "color" / "v1.png"), np.zeros((SIZE, SIZE + 8, 3), np.uint8))
+    assert f"(v1): the colour image is {SIZE + 8} x {SIZE} px" in refusal(prepare)
+
+
+def test_images_without_an_edge_are_refused(prepare, folder):
+    for path in (folder / "color").iterdir():
+        cv2.imwrite(str(path), np.full((SIZE, SIZE, 3), 90, np.uint8))
+    assert "no edge found in any of 6 images" in refusal(prepare)
+
+
+def test_a_wrong_pose_is_named_before_edges_are_looked_for(prepare, folder, monkeypatch):
+    content = json.loads((folder / "meta_data.json").read_text())
+    content["frames"][3]["camtoworld"][0][0] = 7.0
+    (folder / "meta_data.json").write_text(json.dumps(content))
+    monkeypatch.setattr("taichi_edges.detectors.subpixel.trace_pictures", lambda *_: pytest.fail("too late"))
+    assert "v3" in refusal(prepare)
+
+
+def test_fixed_biases_are_taken_as_they_are(prepare):
+    plain = prepare({"edges": "edge_test"}, calibration="off")
+    moved = prepare({"edges": "edge_test"}, calibration={"shift": [0.5, -0.25], "silhouette": "off"})
+    assert "calibration" not in plain[0]
+    assert moved[0]["calibration"]["shift_method"] == "fixed"
+    np.testing.assert_allclose(moved[1].edgels.points, plain[1].edgels.points - [0.5, -0.25], atol=1e-4)
+    outward = prepare({"edges": "edge_test"}, calibration={"shift": "off", "silhouette": 1.5})
+    distances = np.linalg.norm(outward[1].edgels.points - plain[1].edgels.points, axis=1)
+    assert np.quantile(distances, 0.5) == pytest.approx(1.5, abs=0.05)  # most edgels of a box in view are outlines
+    assert np.quantile(distances, 0.05) == pytest.approx(0.0, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("written", "shift", "silhouette"),
+    [
+        ("off", "off", "off"),
+        (False, "off", "off"),
+        ("auto", "auto", "auto"),
+        ({"shift": False}, "off", "auto"),
+        ({"shift": [1, -0.5], "silhouette": 2}, [1, -0.5], 2),
+    ],
+)
+def test_calibration_in_the_scene(written, shift, silhouette):
+    scene = {"source": {"reader": "synthetic"}, "calibration": written}
+    config = check_scene(scene, Path("x.yaml")).calibration
+    assert (config.shift, config.silhouette) == (shift, silhouette)
+
+
+@pytest.mark.parametrize(
+    ("calibration", "words"),
+    [
+        ({"shift": 3}, "calibration.shift: must be auto, off or [right, down] in pixels"),
+        ({"shift": [1, 2, 3]}, "[right, down]"),
+        ({"silhouette": "much"}, "calibration.silhouette: must be auto, off or a number of pixels"),
+        ({"silhouette": 1e6}, "a number of pixels"),
+        ({"shift": [float("nan"), 0]}, "[right, down]"),
+        ({"width": 1}, "unknown key"),
+    ],
+)
+def test_mistakes_in_the_calibration_are_named(calibration, words):
+    with pytest.raises(UserError) as refused:
+        check_scene({"source": {"reader": "synthetic"}, "calibration": calibration}, Path("x.yaml"))
+    assert words in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_network_from_a_file(prepare, tmp_path):
+    sides = node("Conv", ["image", "kernel", "bias"], "map", kernel_shape=[3, 3], pads=[1] * 4)
+    weights = {"kernel": grey_kernel(SIDES)[None], "bias": np.array([-6.0], np.float32)}
+    onnx = {"model": str(write_network(tmp_path / "dexined_sides.onnx", [sides], weights))}
+    facts, views, _ = prepare({"detector": "onnx", "onnx": onnx}, calibration="off")
+    assert facts["detector"] == "onnx" and facts["edgels"] > 0
+    assert (np.abs(views.edgels.normals[:, 0]) > 0.5).mean() > 0.6  # vertical edges
+    assert "names no ONNX file" in refusal(prepare, {"detector": "onnx"})
+    assert "source.onnx.model" in refusal(prepare, {"detector": "onnx", "onnx": {"model": str(tmp_path / "no.onnx")}})
+
+
+def test_a_synthetic_scene_can_be_traced_in_its_own_pictures(tmp_path):
+    source = {"reader": "synthetic", "part": "block", "views": 4, "size": 120, "detector": "subpixel"}
+    run = Run(check_scene({"name": "test", "source": source}, Path("x.yaml")), tmp_path, threads=1)
+    facts = stages.prepare(run)
+    assert facts["part"] == "block" and "line_width_px" not in facts and facts["edgels"] > 200
+    assert (tmp_path / "truth.json").is_file()
