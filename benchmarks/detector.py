@@ -217,7 +217,7 @@ def measure(scene):
     truth, mesh = sharp_curves(folder / truth_path), read_mesh(folder)
     paths = [str(path) if path.is_file() else "" for path in paths]
     start = time.perf_counter()
-    edgels = trace_pictures(paths, threads=2)
+    edgels, _ = trace_pictures(paths, threads=2)
     seconds = time.perf_counter() - start
     rows = []
     for view, path in enumerate(paths):

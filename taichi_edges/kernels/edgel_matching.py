@@ -86,7 +86,7 @@ class EdgelMatching:
         points, directions = (upload(np.asarray(array, np.float32)) for array in (points, directions))
         grid = (self.grid.rows, self.grid.columns, self.grid.starts, self.grid.elements)
         gates = float(radius), MOST_SINE
-        if len(points):
+        if points.shape[0]:
             find_matches(
                 *blocks_of(points),
                 views.start,
