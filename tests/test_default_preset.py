@@ -19,7 +19,7 @@ def run_scene(folder, part, detector, threads=2):
     return run.folder, run_stages(run)
 
 
-@pytest.mark.parametrize(("part", "detector"), [("bracket", "auto"), ("block", "subpixel")])
+@pytest.mark.parametrize(("part", "detector"), [("wave", "auto"), ("block", "subpixel")])
 def test_edges_are_within_a_third_of_a_pixel_of_the_truth(tmp_path, part, detector):
     folder, record = run_scene(tmp_path / "one", part, detector)
     metrics = json.loads((folder / "metrics.json").read_text())
