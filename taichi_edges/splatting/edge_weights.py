@@ -35,7 +35,7 @@ def weigh_edge_pixels(edge_maps, level, edgels, share):
     for view, edge_map in enumerate(edge_maps):
         edges = edge_map >= level
         counts[view] = np.count_nonzero(edges, axis=1)
-        strengths = _strength_map(edgels, view, edge_map.shape)[edges]
+        strengths = _strength_map(edgels, view, edge_map.shape)[edges].astype(np.float64)
         values.append(np.rint(255.0 * (1.0 - share) + share * strengths).astype(np.uint8))
         if len(strengths):
             means[view] = max(values[-1].mean(), 1.0) / 255.0  # not 0, by which the weights are divided

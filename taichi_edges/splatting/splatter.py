@@ -181,20 +181,23 @@ class Splatter:
         images.mask_words, images.mask_counts = masks
 
     def weights(self, page):
-        """Weights of an edge pixel, on average, and of a background pixel of a page in the loss."""
+        """What the own weights of the edge pixels and of the background pixels of a page are multiplied by in the loss.
+
+        Edge pixels weigh so much on average: the balance of edges and background is that of pixels that weigh alike.
+        """
         pixel_count = self.images.height * self.images.width
-        edges = int(self.images.edge_counts[self.selection.views[page]])
+        view = int(self.selection.views[page])
+        edges = int(self.images.edge_counts[view])
+        edge_weight = background_weight = 1.0 / max(int(self.selection.counts[page]), 1)
         if self.loss_mode == "class_weighted":
-            return 0.5 / max(edges, 1), 0.5 / max(pixel_count - edges, 1)
-        return (1.0 / max(int(self.selection.counts[page]), 1),) * 2
+            edge_weight, background_weight = 0.5 / max(edges, 1), 0.5 / max(pixel_count - edges, 1)
+        mean = self.images.weights.means[view] if self.images.weights else 1.0
+        return float(edge_weight / mean), background_weight
 
     def draw(self, page=0):
         """Transmittance at the pixels selected in `page`, and their loss, added to what is there."""
-        view, level = int(self.selection.views[page]), (self.images.level - 0.5) / 255
-        edge_weight, background_weight = self.weights(page)
-        if self.images.weights:  # the balance of edges and background stays what it is
-            edge_weight /= self.images.weights.means[view]
-        self._compare(self.fields.count, page, view, level, edge_weight, background_weight)
+        level = (self.images.level - 0.5) / 255
+        self._compare(self.fields.count, page, int(self.selection.views[page]), level, *self.weights(page))
 
     def record(self, page=0, orient_weight=0.0, shape_weight=0.0):
         """Loss and gradients of the pixels selected in `page`, through the tape. Gradients ADD to what is there."""
