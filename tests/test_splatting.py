@@ -338,7 +338,7 @@ def drawn_lines(seed):
 
 
 def hidden_pixels(scene, view, points):
-    """(H, W) bool: within 3 px of the pixel of a point that has no edge pixel within 2 px; and points near a tie."""
+    """(H, W) bool: within 5 px of the pixel of a point that has no edge pixel within 2 px; and points near a tie."""
     edges = scene.edge_maps[view] >= 128
     seen = points @ scene.world_to_camera[view, :, :3].T + scene.world_to_camera[view, :, 3]
     pixels = (seen / seen[:, 2:])[:, :2] @ scene.intrinsics[view, :2, :2].T + scene.intrinsics[view, :2, 2]
@@ -348,7 +348,7 @@ def hidden_pixels(scene, view, points):
         if depth > 0 and 0 <= column < edges.shape[1] and 0 <= row < edges.shape[0]:
             window = (np.abs(columns - column) <= 2) & (np.abs(rows - row) <= 2)
             if not edges[window].any():
-                hidden |= (columns - column) ** 2 + (rows - row) ** 2 <= 9
+                hidden |= (columns - column) ** 2 + (rows - row) ** 2 <= 25
     return hidden, tie
 
 

@@ -208,10 +208,12 @@ def test_a_run_ends_early_only_when_nothing_more_is_scheduled(start_taichi, bloc
 def test_flanks_spare_established_edges_but_no_strays(
     start_taichi, block, generator, monkeypatch, least, share_of_strays
 ):
-    """The mask is made anew after every cull; a Gaussian without support of its own has no say in it."""
+    """The mask is made anew after every cull by support; a Gaussian without support of its own has no say in it."""
     views, edges = block
     start_taichi("f32", 2)
-    density = DensityConfig(duplicate_at=[], cull_opacity_at=[0.25, 0.75], cull_support_at=[], reset_opacity=False)
+    density = DensityConfig(
+        duplicate_at=[], cull_opacity_at=[0.6], cull_support_at=[0.25, 0.75], min_support=0.0, reset_opacity=False
+    )
     config = TrainConfig(
         epochs=0, steps=24, density=density, flanks_from=0.5, established_support=least, regularize_from=1.0
     )

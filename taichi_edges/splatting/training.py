@@ -183,7 +183,8 @@ class Training:
                 actions.setdefault(step, []).append(action)
         if self.config.takes_in_flanks:
             first = max(round(self.config.flanks_from * self.total), 1)
-            for step in sorted({first, *(step for step in actions if step > first)}):  # after what changes the edges
+            culls = {max(round(share * self.total), 1) for share in config.cull_support_at}
+            for step in sorted({first, *(step for step in culls if step > first)}):
                 actions.setdefault(step, []).append(self._take_in_flanks)
         return actions
 

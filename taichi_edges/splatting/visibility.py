@@ -15,7 +15,7 @@ from taichi_edges.kernels.points import F32_2D, F32_3D, load_camera, load_point,
 from taichi_edges.splatting.selection import WORD
 
 CLEAR_PX = 2  # an edge pixel so near, in columns and in rows, and the view shows the edge
-REACH_PX = 3  # around the centre of a Gaussian that is hidden; it ends at 3 standard deviations of about 1 px
+REACH_PX = 5  # around the centre of a Gaussian that is hidden: 3 standard deviations of a px, and the way to the next
 U32_3D = ti.types.ndarray(dtype=ti.u32, ndim=3)
 I32_1D = ti.types.ndarray(dtype=ti.i32, ndim=1)
 
@@ -57,7 +57,8 @@ def is_clear(view, row, column, edge_words: ti.template()):
 def mark_disc(view, row, column, hidden: ti.template()):
     """Set the bits of the pixels within REACH_PX of a pixel."""
     for near in range(ti.max(row - REACH_PX, 0), ti.min(row + REACH_PX + 1, hidden.shape[1])):
-        half = ti.cast(ti.sqrt(ti.cast(REACH_PX * REACH_PX - (near - row) * (near - row), ti.f32)), ti.i32)
+        rest = REACH_PX * REACH_PX - (near - row) * (near - row)
+        half = ti.cast(ti.sqrt(rest + 0.5), ti.i32)  # 0.5: a GPU may take the root of 16 to be less than 4
         first, last = ti.max(column - half, 0), ti.min(column + half, WORD * hidden.shape[2] - 1)
         for word in range(first >> 5, (last >> 5) + 1):
             ti.atomic_or(hidden[view, near, word], bits_between(word, first, last))
