@@ -29,21 +29,25 @@ class EdgeImages:
     memory. A GPU gets a copy, view by view, four pixels in a u32: (V, H W / 4). Taichi would copy byte by byte.
 
     mask_words, mask_counts: bit masks (V, H, W / 32) of the pixels that are selected for sure, and their numbers (V,):
-    to begin with the edge pixels, of which there are edge_counts (V,). weights: None, or EdgeWeights on the host;
-    starts (V, H) and values (n,), in a u32 four of them, are for the kernels.
+    to begin with the edge pixels, edge_words and edge_counts; line_words and line_counts with the flanks of the lines,
+    where those are wanted. weights: None, or EdgeWeights on the host; starts (V, H) and values (n,), in a u32 four of
+    them, are for the kernels.
     """
 
-    def __init__(self, edge_maps, threshold, weigh=None, on_gpu=False):
+    def __init__(self, edge_maps, threshold, weigh=None, flanks=False, on_gpu=False):
         """edge_maps: (V, H, W) uint8. threshold: of full scale; from here on a pixel is an edge pixel.
 
-        weigh: function (edge_maps, level) -> EdgeWeights, or None.
+        weigh: function (edge_maps, level) -> EdgeWeights, or None. flanks: whether they are wanted.
         """
         _, self.height, self.width = edge_maps.shape
         self.level = int(np.ceil(threshold * 255))
         words, self.edge_counts = bright_words(edge_maps, self.level)
         self.maps = _upload_maps(edge_maps) if on_gpu else np.ascontiguousarray(edge_maps)
         self.edge_words = upload(words)
-        self.mask_words, self.mask_counts = self.edge_words, self.edge_counts
+        self.mask_words, self.mask_counts = self.line_words, self.line_counts = self.edge_words, self.edge_counts
+        if flanks:
+            words, self.line_counts = bright_words(edge_maps, min(int(np.ceil(LINE_FOOT * 255)), self.level))
+            self.line_words = upload(words)
         self.weights = weigh(edge_maps, self.level) if weigh else None
         weights = self.weights or EdgeWeights(np.zeros((1, 1), np.int32), np.zeros(1, np.uint8), None)
         values = np.pad(weights.values, (0, -len(weights.values) % 4 or 4 * (len(weights.values) == 0)))
@@ -111,17 +115,12 @@ class Splatter:
         self.loss_mode, self.threads, self.schedule, self.real = loss, threads, schedule, real
         weighted = edgels is not None and strength_weight > 0
         weigh = partial(weigh_edge_pixels, edgels=edgels, share=strength_weight) if weighted else None
-        self.images = EdgeImages(edge_maps, edge_threshold, weigh, on_gpu=schedule == "log")
+        self.images = EdgeImages(edge_maps, edge_threshold, weigh, flanks, on_gpu=schedule == "log")
         self.projections = np.asarray(intrinsics) @ np.asarray(world_to_camera)
         self.cameras = CameraFields(np.asarray(intrinsics), np.asarray(world_to_camera), real)
-        height, width = self.images.height, self.images.width
-        balanced, counts = loss == "balanced", self.images.edge_counts
-        self.line_words, line_counts = self.images.edge_words, counts
-        if flanks:
-            words, line_counts = bright_words(edge_maps, min(int(np.ceil(LINE_FOOT * 255)), self.images.level))
-            self.line_words = upload(words)
-        most = min(int((counts + line_counts).max()), height * width) if balanced else height * width
-        slots = round_capacity(most)
+        height, width, balanced = self.images.height, self.images.width, loss == "balanced"
+        most = int((self.images.edge_counts + self.images.line_counts).max()) if balanced else height * width
+        slots = round_capacity(min(most, height * width))
         pages, planes = PAGES if balanced else 1, threads if schedule == "product" else 1
         self.selection = PixelSelection(height, width, slots, pages, planes, real)
         self.loss = ti.ndarray(real, shape=(), needs_grad=True)  # a field would take the tape two launches to reset
@@ -177,7 +176,7 @@ class Splatter:
         points: (n, 3) unit cube, on edges that are known to be there: where one of them is hidden, flanks are not.
         """
         images = self.images
-        masks = mask_with_flanks(images.edge_words, self.line_words, self.projections, points)
+        masks = mask_with_flanks(images.edge_words, images.line_words, self.projections, points)
         images.mask_words, images.mask_counts = masks
 
     def weights(self, page):

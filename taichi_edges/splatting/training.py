@@ -223,12 +223,11 @@ class Training:
     def _take_in_flanks(self, population):
         """The mask with the flanks of the lines, except where an edge that other views have established is hidden."""
         config, gaussians = self.config, population.gaussians
-        points = gaussians.means[gaussians.opacities >= ESTABLISHED_OPACITY].astype(np.float64)
+        points = np.zeros((0, 3))
         if config.established_support > 0:
+            points = gaussians.means[gaussians.opacities >= ESTABLISHED_OPACITY].astype(np.float64)
             points = points[exclusive_support(self.views, points, config.edge_threshold) >= config.established_support]
-            self.splatter.take_in_flanks(points)
-        else:
-            self.splatter.take_in_flanks(points[:0])
+        self.splatter.take_in_flanks(points)
         return population
 
     def _limit_opacity(self, population):
