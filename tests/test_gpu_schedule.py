@@ -42,7 +42,7 @@ PIXEL = 0.02  # at the block below, unit-cube units
 
 # Errors of T, and of gradients relative to a group's largest. f64: a product against a sum of logarithms of some 100
 # factors, 1e-16 for each, in gradients times up to 1e3 for 1 / (1 - a), times up to 1e3 in the projection of needles.
-# f32: 6e-8 times 1e3 as in test_splatting.py, in gradients some more for the needles next to the camera inside the cube.
+# f32: 6e-8 times 1e3 as in test_splatting.py, in gradients more for the needles next to the camera inside the cube.
 # Where a GPU takes the logarithm near 1 with an error of 5e-7, as Vulkan allows, that is 5e-5 for some 100 factors.
 IMAGE = {"f64": 1e-12, "f32": 3e-4}
 GRADIENT = {"f64": 1e-10, "f32": 5e-4}

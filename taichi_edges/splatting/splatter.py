@@ -176,7 +176,7 @@ class Splatter:
         points: (n, 3) unit cube, on edges that are known to be there: where one of them is hidden, flanks are not.
         """
         images = self.images
-        masks = mask_with_flanks(images.edge_words, images.line_words, self.projections, points)
+        masks = mask_with_flanks(images.edge_words, images.line_words, images.width, self.projections, points)
         images.mask_words, images.mask_counts = masks
 
     def weights(self, page):

@@ -20,17 +20,18 @@ U32_3D = ti.types.ndarray(dtype=ti.u32, ndim=3)
 I32_1D = ti.types.ndarray(dtype=ti.i32, ndim=1)
 
 
-def mask_with_flanks(edge_words, line_words, projections, points):
+def mask_with_flanks(edge_words, line_words, width, projections, points):
     """The pixels that are in the loss of each view for sure: those of lines, but no flanks where `points` are hidden.
 
     edge_words, line_words: (V, H, W / 32) bit masks of the edge pixels and of all pixels of the lines, where the
-    kernels have them. projections: (V, 3, 4) world to pixels. points: (n, 3) on edges that are known to be there.
+    kernels have them. width: of the images, pixels. projections: (V, 3, 4) world to pixels. points: (n, 3) on edges that are known to be there.
     Returns the masks, where the others are, and how many pixels each has, (V,) int64.
     """
     mask = upload(np.zeros(edge_words.shape, np.uint32))
     counts = upload(np.zeros(len(projections), np.int32))
     if len(points):
-        mark_hidden(upload(points.astype(np.float32)), upload(projections.astype(np.float32)), edge_words, mask)
+        points, projections = upload(points.astype(np.float32)), upload(projections.astype(np.float32))
+        mark_hidden(width, points, projections, edge_words, mask)
     take_in_flanks(edge_words, line_words, mask, counts)
     return mask, download(counts).astype(np.int64)
 
@@ -65,13 +66,13 @@ def mark_disc(view, row, column, hidden: ti.template()):
 
 
 @ti.kernel
-def mark_hidden(points: F32_2D, projections: F32_3D, edge_words: U32_3D, hidden: U32_3D):
+def mark_hidden(width: ti.i32, points: F32_2D, projections: F32_3D, edge_words: U32_3D, hidden: U32_3D):
     """Set the bits around the projections of points with no edge pixel near, in all views."""
     for view, i in ti.ndrange(projections.shape[0], points.shape[0]):
         h = load_camera(projections, view) @ load_point(points, i)
         if h[2] > 0:
             row, column = nearest_pixel(h)
-            if 0 <= row and row < hidden.shape[1] and 0 <= column and column < WORD * hidden.shape[2]:
+            if 0 <= row and row < hidden.shape[1] and 0 <= column and column < width:
                 if is_clear(view, row, column, edge_words):
                     mark_disc(view, row, column, hidden)
 
