@@ -24,8 +24,8 @@ def mask_with_flanks(edge_words, line_words, width, projections, points):
     """The pixels that are in the loss of each view for sure: those of lines, but no flanks where `points` are hidden.
 
     edge_words, line_words: (V, H, W / 32) bit masks of the edge pixels and of all pixels of the lines, where the
-    kernels have them. width: of the images, pixels. projections: (V, 3, 4) world to pixels. points: (n, 3) on edges that are known to be there.
-    Returns the masks, where the others are, and how many pixels each has, (V,) int64.
+    kernels have them. width: of the images, pixels. projections: (V, 3, 4) world to pixels. points: (n, 3) on edges
+    that are known to be there. Returns the masks, where the others are, and how many pixels each has, (V,) int64.
     """
     mask = upload(np.zeros(edge_words.shape, np.uint32))
     counts = upload(np.zeros(len(projections), np.int32))
