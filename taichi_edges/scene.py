@@ -138,6 +138,16 @@ class TrainConfig(Section):
         0.5, description="of full scale; from here on a pixel is an edge pixel"
     )
     loss: Literal["balanced", "class_weighted", "whole_image"] = Field("balanced", description="balanced is eq. 3")
+    strength_weight: Share = Field(
+        0.0, description="share of an edge pixel's weight in the loss that is its edgel's strength; 0: all weigh alike"
+    )
+    flanks_from: Share = Field(
+        1.0, description="share of the run after which the mask takes in the flanks of the lines; 1: never"
+    )
+    established_support: Share = Field(
+        0.0,
+        description="share of the views that supports an edge, so that where it is hidden, flanks spare it; 0: never",
+    )
     only_means: Share = Field(0.06, description="share of the run that trains positions only")
     learning_rates: LearningRates = LearningRates()
     means_decay: Positive = Field(0.75, description="factor on the rate of the means")
@@ -156,6 +166,11 @@ class TrainConfig(Section):
         if bool(self.epochs) == bool(self.steps):
             raise ValueError("the length is given in epochs or in steps; set one of them, and the other to 0")
         return self
+
+    @property
+    def takes_in_flanks(self):
+        """Whether the mask of eq. 3 takes in the flanks of the lines; a whole image has them anyway."""
+        return self.loss == "balanced" and self.flanks_from < 1
 
 
 class FilterConfig(Section):
@@ -251,6 +266,9 @@ PRESETS = {
             "initial_scale": 0.004,
             "initial_opacity": 0.08,
             "loss": "balanced",
+            "strength_weight": 0.0,
+            "flanks_from": 1.0,
+            "established_support": 0.0,
             "only_means": 0.06,
             "learning_rates": {"means": 1e-3, "scales": 2e-4, "opacities": 3e-2, "quaternions": 1e-3},
             "means_decay": 0.75,
@@ -276,6 +294,9 @@ PRESETS = {
             "seeds": "votes",
             "initial_opacity": 0.3,
             "loss": "balanced",
+            "strength_weight": 0.5,
+            "flanks_from": 0.5,
+            "established_support": 0.1,
             "only_means": 0.15,
             "learning_rates": {"means": 2e-3, "scales": 5e-3, "opacities": 3e-2, "quaternions": 5e-3},
             "means_decay": 0.84,

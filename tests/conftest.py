@@ -92,7 +92,8 @@ def open_splatter(start_taichi):
         if is_open["key"] != key or is_open["runtime"] is not ti.lang.impl.get_runtime():
             start_taichi(real, threads, arch)
             arguments = (scene.edge_maps, scene.intrinsics, scene.world_to_camera, 1)
-            splatter = Splatter(*arguments, threads=threads, real=REALS[real], **options)
+            edgels = getattr(scene, "edgels", None)
+            splatter = Splatter(*arguments, threads=threads, real=REALS[real], edgels=edgels, **options)
             old.append(splatter)
             is_open.update(key=key, runtime=ti.lang.impl.get_runtime(), splatter=splatter)
         return is_open["splatter"]

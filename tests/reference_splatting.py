@@ -11,6 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from taichi_edges.edgels import Edgels
 from taichi_edges.splatting.gaussians import Gaussians
 from taichi_edges.synthetic.rendering import look_at
 
@@ -116,11 +117,12 @@ OUTSIDE, OBLIQUE, INSIDE, NO_EDGES, MOSTLY_EDGES = range(5)  # the views of a ra
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Edge maps (V, H, W) uint8 with their cameras, intrinsics (V, 3, 3) and world_to_camera (V, 3, 4)."""
+    """Edge maps (V, H, W) uint8 with their cameras, intrinsics (V, 3, 3) and world_to_camera (V, 3, 4), and Edgels."""
 
     edge_maps: np.ndarray
     intrinsics: np.ndarray
     world_to_camera: np.ndarray
+    edgels: Edgels | None = None
 
     def camera(self, view):
         """Intrinsics and pose of a view."""
@@ -144,7 +146,32 @@ def random_scene(seed, width=50, height=40, grey=True):
     intrinsics = np.array([[1.9 * width, 0, 0.45 * width], [0, 2.1 * width, 0.55 * height], [0, 0, 1]])
     centres = np.array([[0.4, -1.0, 0.8], [2.0, 1.5, 1.9], [0.5, 0.45, 0.55], [-1.0, 0.3, 0.2], [0.6, 2.0, -0.4]])
     poses = np.stack([look_at(centre, generator.uniform(0.4, 0.6, 3)) for centre in centres])
-    return Scene(edge_maps, np.repeat(intrinsics[None], 5, axis=0), poses)
+    edgels = Edgels.of_views(random_edgels(count, width, height, generator) for count in (30, 60, 0, 20, 90))
+    return Scene(edge_maps, np.repeat(intrinsics[None], 5, axis=0), poses, edgels)
+
+
+def random_edgels(count, width, height, generator):
+    """Points (n, 2), some outside the image and some together in a pixel, normals (n, 2) and strengths (n,)."""
+    points = generator.uniform([-3, -3], [width + 2, height + 2], (count, 2))
+    points[: count // 4] = points[count // 4 : 2 * (count // 4)]
+    return points, np.tile([1.0, 0.0], (count, 1)), generator.random(count)
+
+
+def edge_weights(scene, view, level, share):
+    """(H, W) weights of the pixels of a view in their class: 1 - share + share * strength, 1 of the background.
+
+    The strength of an edge pixel is that of the strongest edgel within 2 px in columns and in rows, 0 without one; in
+    steps of 1/255, as the weight is.
+    """
+    edge_map = scene.edge_maps[view]
+    points, _, strengths = scene.edgels.of_view(view)
+    weights = np.ones(edge_map.shape)
+    for row, column in np.argwhere(edge_map >= level):
+        inside = ((np.rint(points) >= 0) & (np.rint(points) <= np.array(edge_map.shape)[::-1] - 1)).all(axis=1)
+        near = inside & (np.abs(np.rint(points) - [column, row]).max(axis=1, initial=0) <= 2)
+        strength = float(np.rint(255 * strengths[near]).max(initial=0))
+        weights[row, column] = np.rint(255 * (1 - share) + share * strength) / 255
+    return weights
 
 
 def random_gaussians(count, generator, large=0):
@@ -183,7 +210,8 @@ def selected(splatter, page=0):
         pixels = maps.to_numpy().astype("<u4").view(np.uint8)[:, : images.height * images.width]
         maps = pixels.reshape(-1, images.height, images.width)
     edges = maps[selection.views[page], rows, columns] >= images.level
-    return np.stack([columns, rows], axis=1), np.where(edges, *splatter.weights(page)), targets
+    weights = selection.weights.to_numpy()[page, :count].astype(np.float64)
+    return np.stack([columns, rows], axis=1), weights * np.where(edges, *splatter.weights(page)), targets
 
 
 def unpacked(masks):

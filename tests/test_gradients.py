@@ -72,6 +72,22 @@ def test_gradients_of_the_image_loss(open_splatter, seed, generator, view, large
     assert_gradients(gradients(splatter), expected, TOLERANCE["f64"])
 
 
+@pytest.mark.parametrize("record", ["hand adjoint", "Taichi's own"])
+def test_gradients_of_the_loss_with_weights_and_flanks(open_splatter, seed, generator, record):
+    scene, gaussians = random_scene(seed, WIDTH, HEIGHT), random_gaussians(25, generator)
+    splatter = open_splatter(scene, strength_weight=0.7, flanks=True)
+    splatter.take_in_flanks(gaussians.means)
+    splatter.load(gaussians)
+    for view in (OUTSIDE, OBLIQUE):
+        splatter.select_pixels(view, 1)
+        pixels = selected(splatter)
+        assert len(np.unique(pixels[1])) > 10, "many weights"
+        splatter.load(gaussians)
+        splatter.record() if record == "hand adjoint" else AutodiffSplat(splatter).record()
+        expected = gradient(lambda moved: image_loss(moved, scene.camera(view), *pixels), gaussians)
+        assert_gradients(gradients(splatter), expected, TOLERANCE["f64"])
+
+
 @pytest.mark.parametrize("view", VIEWS)
 def test_hand_adjoint_equals_taichis_own(open_splatter, seed, generator, view):
     splatter = open_splatter(random_scene(seed, WIDTH, HEIGHT))

@@ -58,7 +58,9 @@ def test_the_paper_preset_has_the_numbers_of_the_supplement():
     assert train["neighbors"] == 4  # k of eq. 4
     assert (train["orient_weight"], train["shape_weight"]) == (0.1, 0.1)  # object level scenes
     assert (train["regularize_from"] * 500, train["regularize_every"]) == (300, 10)
-    assert train["loss"] == "balanced"  # eq. 3
+    # eq. 3: all edge pixels, and as many of the background, all weighing alike
+    assert train["loss"] == "balanced"
+    assert (train["strength_weight"], train["flanks_from"]) == (0.0, 1.0)
 
 
 def test_clustering_and_fitting_start_from_the_supplement(scene):

@@ -12,6 +12,7 @@ from reference_splatting import (
     PARAMETERS,
     Scene,
     alphas,
+    edge_weights,
     image_loss,
     project,
     random_gaussians,
@@ -287,6 +288,91 @@ def test_threshold_parts_edges_from_background_at_the_same_level_as_the_views(op
     assert splatter.images.edge_counts[0] == len(edges)
     columns, rows = selected(splatter)[0].T
     assert np.isin(edges, rows * 16 + columns).all()
+
+
+# Weights and flanks ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.6, 1.0])
+@pytest.mark.parametrize("loss", ["balanced", "whole_image", "class_weighted"])
+def test_edge_pixels_weigh_what_the_strongest_edgel_near_says(open_splatter, seed, loss, share):
+    scene = random_scene(seed, WIDTH, HEIGHT)
+    splatter = open_splatter(scene, loss=loss, strength_weight=share)
+    for view in (*VIEWS, MOSTLY_EDGES):  # INSIDE has no edgel
+        splatter.select_pixels(view, 3)
+        pixels, weights, targets = selected(splatter)
+        edges = targets >= 127.5 / 255
+        columns, rows = pixels.T
+        expected = edge_weights(scene, view, 128, share)[rows, columns]
+        own = splatter.selection.weights.to_numpy()[0, : len(pixels)]
+        np.testing.assert_allclose(own, expected, rtol=1e-15)
+        if own[edges].max() > 0:  # else none of them has a say
+            equal = 0.5 if loss == "class_weighted" else edges.sum() / len(pixels)
+            assert weights[edges].sum() == pytest.approx(equal, rel=1e-12), "the balance is kept"
+
+
+def test_weights_are_those_of_the_view_on_every_page(open_splatter, seed, monkeypatch):
+    scene = random_scene(seed, WIDTH, HEIGHT)
+    splatter = open_splatter(scene, strength_weight=0.6)
+    for most in (splatter_module.MOST_ELEMENTS, 1):
+        monkeypatch.setattr(splatter_module, "MOST_ELEMENTS", most)
+        splatter.select_pixels([MOSTLY_EDGES, OUTSIDE, OBLIQUE], [1, 2, 3])
+        for page, view in enumerate((MOSTLY_EDGES, OUTSIDE, OBLIQUE)):
+            columns, rows = selected(splatter, page)[0].T
+            own = splatter.selection.weights.to_numpy()[page, : len(columns)]
+            np.testing.assert_allclose(own, edge_weights(scene, view, 128, 0.6)[rows, columns], rtol=1e-15)
+
+
+def drawn_lines(seed):
+    """A random scene with maps of some lines instead, and with points of which many are hidden."""
+    generator = np.random.default_rng(seed)
+    scene = random_scene(seed, WIDTH, HEIGHT)
+    maps = np.zeros_like(scene.edge_maps)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    for edge_map in maps:
+        normal, at = generator.normal(size=2), generator.uniform([10, 10], [WIDTH - 10, HEIGHT - 10])
+        across = ((columns - at[0]) * normal[0] + (rows - at[1]) * normal[1]) / np.linalg.norm(normal)
+        edge_map[:] = np.rint(255 * np.exp(-0.5 * across**2))
+    points = generator.uniform(-0.2, 1.2, (60, 3)).astype(np.float32).astype(np.float64)
+    return Scene(maps, scene.intrinsics, scene.world_to_camera, scene.edgels), points
+
+
+def hidden_pixels(scene, view, points):
+    """(H, W) bool: within 5 px of the pixel of a point that has no edge pixel within 2 px; and points near a tie."""
+    edges = scene.edge_maps[view] >= 128
+    seen = points @ scene.world_to_camera[view, :, :3].T + scene.world_to_camera[view, :, 3]
+    pixels = (seen / seen[:, 2:])[:, :2] @ scene.intrinsics[view, :2, :2].T + scene.intrinsics[view, :2, 2]
+    hidden, tie = np.zeros_like(edges), (np.abs(pixels - np.floor(pixels) - 0.5) < 1e-3).any(axis=1)
+    rows, columns = np.mgrid[: edges.shape[0], : edges.shape[1]]
+    for (column, row), depth in zip(np.floor(pixels + 0.5), seen[:, 2]):
+        if depth > 0 and 0 <= column < edges.shape[1] and 0 <= row < edges.shape[0]:
+            window = (np.abs(columns - column) <= 2) & (np.abs(rows - row) <= 2)
+            if not edges[window].any():
+                hidden |= (columns - column) ** 2 + (rows - row) ** 2 <= 25
+    return hidden, tie
+
+
+@pytest.mark.parametrize("schedule", ["product", "log"])
+def test_flanks_are_in_the_mask_but_where_an_established_edge_is_hidden(open_splatter, seed, schedule):
+    scene, points = drawn_lines(seed)
+    ties = np.any([hidden_pixels(scene, view, points)[1] for view in range(5)], axis=0)
+    points = points[~ties]  # single precision may round them to the next pixel
+    splatter = open_splatter(scene, flanks=True, schedule=schedule)
+    spared = 0
+    for known in (points, points[:0]):
+        splatter.take_in_flanks(known)
+        for view in range(5):
+            edges, line = scene.edge_maps[view] >= 128, scene.edge_maps[view] >= 3
+            expected = edges | (line & ~hidden_pixels(scene, view, known)[0])
+            spared += (line & ~expected).sum()
+            assert splatter.select_pixels(view, 1) == expected.sum() + edges.sum()
+            pixels, weights, _ = selected(splatter)
+            assert len(np.unique(pixels, axis=0)) == len(pixels), "no pixel twice"
+            chosen = np.zeros(edges.shape, bool)
+            chosen[pixels[:, 1], pixels[:, 0]] = True
+            assert chosen[expected].all()
+            np.testing.assert_allclose(weights, 1 / len(pixels), rtol=1e-15)
+    assert spared > 20, "the scene hides something"
 
 
 # Gaussians ------------------------------------------------------------------------------------------------------------

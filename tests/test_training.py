@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from taichi_edges.detectors.drawing import draw_edge_maps
+from taichi_edges.detectors.ridges import trace_ridges
 from taichi_edges.errors import UserError
 from taichi_edges.progress import Progress
-from taichi_edges.scene import DensityConfig, TrainConfig
+from taichi_edges.scene import DensityConfig, LearningRates, TrainConfig
 from taichi_edges.splatting.density import Population, cull_opacity, cull_support, duplicate
 from taichi_edges.splatting.gaussians import Gaussians, logit, start_gaussians
 from taichi_edges.splatting.seeding import random_points
 from taichi_edges.splatting.training import Settling, Training, nearest_neighbors, rates
+from taichi_edges.support import line_width
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import Imperfections, render_views
 from taichi_edges.synthetic.visibility import sample_edges
@@ -201,6 +204,36 @@ def test_a_run_ends_early_only_when_nothing_more_is_scheduled(start_taichi, bloc
     assert records[-1].step == end
 
 
+@pytest.mark.parametrize("least, share_of_strays", [(0.0, None), (0.3, 0.1)])
+def test_flanks_spare_established_edges_but_no_strays(
+    start_taichi, block, generator, monkeypatch, least, share_of_strays
+):
+    """The mask is made anew after every cull by support; a Gaussian without support of its own has no say in it."""
+    views, edges = block
+    start_taichi("f32", 2)
+    density = DensityConfig(
+        duplicate_at=[], cull_opacity_at=[0.6], cull_support_at=[0.25, 0.75], min_support=0.0, reset_opacity=False
+    )
+    config = TrainConfig(
+        epochs=0, steps=24, density=density, flanks_from=0.5, established_support=least, regularize_from=1.0
+    )
+    rates = {"means": 0.0, "scales": 0.0, "opacities": 0.0, "quaternions": 0.0}
+    config = config.model_copy(update={"learning_rates": LearningRates(**rates)})
+    off = generator.random((200, 3))
+    off = off[cKDTree(edges).query(off)[0] > 5 * PIXEL]
+    on = edges[:: len(edges) // 200]
+    training = Training(views, config, generator, threads=2)
+    given, take_in = [], training.splatter.take_in_flanks
+    monkeypatch.setattr(training.splatter, "take_in_flanks", lambda points: (given.append(points), take_in(points)))
+    training.run(start_gaussians(np.concatenate([on, off]), generator, 0.01, 0.5), Progress())
+    assert sorted(step for step, actions in training.actions.items() if training._take_in_flanks in actions) == [12, 18]
+    for points in given:
+        strays = (cKDTree(edges).query(points)[0] > 4 * PIXEL).sum() if len(points) else 0
+        assert len(points) == 0 if share_of_strays is None else len(points) > 0.5 * len(on)
+        assert strays <= (share_of_strays or 0) * len(off)
+    assert len(given) == 2
+
+
 def test_no_end_before_the_regularizers_have_begun(start_taichi, block):
     density = DensityConfig(duplicate_at=[], cull_opacity_at=[], cull_support_at=[])
     config = TrainConfig(epochs=0, steps=120, settled=1.0, gaussians=300, regularize_from=0.75, density=density)
@@ -268,11 +301,35 @@ def test_training_finds_the_edges_of_a_block(start_taichi, block):
         assert np.isfinite(array).all()
 
 
+def test_flanks_bring_the_centres_onto_the_lines(start_taichi, block):
+    """From starts beside the edges, with rates at which a Gaussian can shrink within the run."""
+    views, edges = block
+    views, medians = replace(views, edge_maps=redrawn(views)), []
+    fast = {"means_decay": 0.84, "means_decay_every": 0.05, "means_decays": 20, "only_means": 0.1}
+    rates = LearningRates(means=2e-3, scales=5e-3, opacities=3e-2, quaternions=5e-3)
+    density = DensityConfig(duplicate_at=[], cull_opacity_at=[], cull_support_at=[])
+    for share in (1.0, 0.5):
+        start_taichi("f32", 2)
+        generator = np.random.default_rng(1)
+        beside = edges[generator.choice(len(edges), 600)] + generator.normal(size=(600, 3)) * PIXEL
+        config = TrainConfig(epochs=0, steps=240, density=density, flanks_from=share, learning_rates=rates, **fast)
+        training = Training(views, config, generator, threads=2)
+        trained, _ = training.run(start_gaussians(beside, generator, 0.01, 0.3), Progress())
+        assert (trained.opacities > 0.2).sum() > 500
+        medians.append(np.median(cKDTree(edges).query(trained.means[trained.opacities > 0.2])[0]))
+    assert medians[1] < 0.9 * medians[0] < 0.1 * PIXEL
+
+
+def redrawn(views):
+    """The edge maps of some views, drawn as lines of one width through their ridges."""
+    edgels = trace_ridges(views.edge_maps, line_width(views, 0.5)[0], 0.3)
+    return draw_edge_maps(edgels, views.height, views.width)
+
+
 def test_the_same_seed_trains_the_same_gaussians(start_taichi, block):
     density = DensityConfig(duplicate_at=[0.5], cull_opacity_at=[], cull_support_at=[0.75])
-    config = TrainConfig(
-        epochs=8, gaussians=1500, only_means=0.4, regularize_from=0.6, regularize_every=3, density=density
-    )
+    schedule = {"only_means": 0.4, "regularize_from": 0.6, "regularize_every": 3, "flanks_from": 0.5}
+    config = TrainConfig(epochs=8, gaussians=1500, density=density, established_support=0.1, **schedule)
     runs = [train(start_taichi, block, config) for _ in range(2)]
     for one, other in zip(vars(runs[0][1]).values(), vars(runs[1][1]).values()):
         assert one.tobytes() == other.tobytes()

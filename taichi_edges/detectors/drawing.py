@@ -10,14 +10,15 @@ DRAWN_AT_ONCE = 256  # points; few enough that their patches stay in the cache a
 
 
 def draw_edge_maps(edgels, height, width, threads=None):
-    """(V, H, W) uint8 edge maps through the edgels, some of them at a time.
+    """(V, H, W) uint8 edge maps through the edgels, some views at a time.
 
-    Weak lines are drawn half as high as sure ones: all of them are edge pixels, and the sure ones stand out.
+    Every line is drawn at full height, or a weak one would teach its Gaussians to be faint, and be narrower from a
+    threshold on: how sure an edgel is weighs in the loss instead.
     """
 
     def draw(view):
-        points, normals, strengths = edgels.of_view(view)
-        return draw_lines(points, normals, 0.5 + 0.5 * strengths, height, width)
+        points, normals, _ = edgels.of_view(view)
+        return draw_lines(points, normals, np.ones(len(points), np.float32), height, width)
 
     with ThreadPoolExecutor(threads) as pool:  # NumPy releases the lock in the long loops
         return np.stack(list(pool.map(draw, range(edgels.view_count))))

@@ -25,9 +25,10 @@ def pack_mask(edges):
 class PixelSelection:
     """The selected pixels of up to `pages` views, and what the splat computes at those of the current one.
 
-    Per page: words (pages, H, W / 32, 2) mask and number of selected pixels before; columns and targets (0..1) of the
-    slots, (pages, capacity); on the host views and counts of selected pixels, (pages,). Of the current page: planes
-    (threads or 1, capacity), from which the transmittance (capacity,) is combined, and adjoint (capacity,) = -T dL/dT.
+    Per page: words (pages, H, W / 32, 2) mask and number of selected pixels before; columns, targets (0..1) and weights
+    (0..1, among the pixels of their class) of the slots, (pages, capacity); on the host views and counts of selected
+    pixels, (pages,). Of the current page: planes (threads or 1, capacity), from which the transmittance (capacity,) is
+    combined, and adjoint (capacity,) = -T dL/dT.
     """
 
     def __init__(self, height, width, capacity, pages, planes, real=ti.f32):
@@ -35,6 +36,8 @@ class PixelSelection:
         self.words = ti.ndarray(ti.u32, shape=(pages, height, -(-width // WORD), 2))
         self.columns = ti.field(real, shape=(pages, capacity))
         self.targets = ti.field(real, shape=(pages, capacity))
+        self.weights = ti.field(real, shape=(pages, capacity))
+        self.weights.fill(1.0)  # and that they stay, unless edge pixels have weights of their own
         self.planes = ti.field(real, shape=(planes, capacity))
         self.transmittance = ti.field(real, shape=capacity)
         self.adjoint = ti.field(real, shape=capacity)
@@ -99,13 +102,15 @@ def whole_word(word, width):
     return ti.u32(0xFFFFFFFF) >> ti.cast(ti.max((word + 1) * WORD - width, 0), ti.u32)
 
 
-def make_list_row(selection, packed):
-    """ti.func list_row(page, view, row, width, first, edge_maps, words): fill the slots of a row from `first` on.
+def make_list_row(selection, packed, level):
+    """ti.func list_row(page, view, row, width, first, edge_maps, starts, weights, words): fill the slots of a row.
 
-    Returns the first slot of the next row. packed: whether edge maps are four pixels in a u32, (V, H W / 4), or u8
-    (V, H, W).
+    They are filled from `first` on. Returns the first slot of the next row. packed: whether edge maps and weights are
+    four in a u32, (V, H W / 4) and (n / 4,), or u8, (V, H, W) and (n,). level: 0..255, from which on a pixel takes the
+    next of the weights, from that at starts (V, H) on; None: all weigh alike.
     """
-    columns, targets, real = selection.columns, selection.targets, selection.real
+    columns, targets, slot_weights, real = selection.columns, selection.targets, selection.weights, selection.real
+    weighted, level = level is not None, level or 0
 
     @ti.func
     def grey_level(view, row, column, width, edge_maps: ti.template()):
@@ -115,11 +120,32 @@ def make_list_row(selection, packed):
             level = (edge_maps[view, pixel >> 2] >> ti.cast((pixel & 3) << 3, ti.u32)) & ti.u32(255)
         else:
             level = ti.cast(edge_maps[view, row, column], ti.u32)
-        return ti.cast(level, real)
+        return level
 
     @ti.func
-    def list_row(page, view, row, width, first, edge_maps: ti.template(), words: ti.template()):
-        slot = first
+    def weight_of(edge, weights: ti.template()):
+        weight = ti.u32(0)
+        if ti.static(packed):
+            weight = (weights[edge >> 2] >> ti.cast((edge & 3) << 3, ti.u32)) & ti.u32(255)
+        else:
+            weight = ti.cast(weights[edge], ti.u32)
+        return ti.cast(weight, real) * (1.0 / 255.0)
+
+    @ti.func
+    def list_row(
+        page,
+        view,
+        row,
+        width,
+        first,
+        edge_maps: ti.template(),
+        starts: ti.template(),
+        weights: ti.template(),
+        words: ti.template(),
+    ):
+        slot, edge = first, 0
+        if ti.static(weighted):
+            edge = starts[view, row]
         for word in range(words.shape[2]):
             words[page, row, word, 1] = ti.cast(slot, ti.u32)
             bits = words[page, row, word, 0]
@@ -127,26 +153,34 @@ def make_list_row(selection, packed):
                 column = word * WORD + lowest_bit(bits)
                 bits &= bits - ti.u32(1)
                 columns[page, slot] = ti.cast(column, real)
-                targets[page, slot] = grey_level(view, row, column, width, edge_maps) * (1.0 / 255.0)
+                grey = grey_level(view, row, column, width, edge_maps)
+                targets[page, slot] = ti.cast(grey, real) * (1.0 / 255.0)
+                if ti.static(weighted):
+                    weight = ti.cast(1.0, real)
+                    if grey >= ti.u32(level):
+                        weight = weight_of(edge, weights)
+                        edge += 1
+                    slot_weights[page, slot] = weight
                 slot += 1
         return slot
 
     return list_row
 
 
-def make_select(selection, threads, schedule):
-    """select(count, views, seeds, backgrounds, edge_maps, edge_words, words): one view per page, in parallel.
+def make_select(selection, threads, schedule, level=None):
+    """select(count, views, seeds, backgrounds, edge_maps, mask_words, starts, weights, words): one view per page.
 
-    views, seeds, backgrounds: (count,). All edge pixels of a view and `background` others, drawn without repetition
-    (paper eq. 3); every pixel where `background` is negative. One seed gives one selection, whatever the schedule.
+    views, seeds, backgrounds: (count,). All pixels of a view's mask, which has at least its edge pixels, and
+    `background` others, drawn without repetition (paper eq. 3); every pixel where `background` is negative. One seed
+    gives one selection, whatever the schedule. level, starts, weights: see `make_list_row`.
     """
-    return make_select_parallel(selection) if schedule == "log" else make_select_pages(selection, threads)
+    return make_select_parallel(selection, level) if schedule == "log" else make_select_pages(selection, threads, level)
 
 
-def make_select_pages(selection, threads):
+def make_select_pages(selection, threads, level):
     """Kernel select for a CPU: one page is one thread's."""
     lanes = min(threads, selection.pages)  # pages worked on at once
-    list_row = make_list_row(selection, packed=False)
+    list_row = make_list_row(selection, False, level)
 
     @ti.func
     def draw_background(page, seed, background, width, height, words: ti.template()):
@@ -165,17 +199,25 @@ def make_select_pages(selection, threads):
 
     @ti.func
     def fill_page(
-        page, view, seed, background, edge_maps: ti.template(), edge_words: ti.template(), words: ti.template()
+        page,
+        view,
+        seed,
+        background,
+        edge_maps: ti.template(),
+        mask_words: ti.template(),
+        starts: ti.template(),
+        weights: ti.template(),
+        words: ti.template(),
     ):
         height, width = edge_maps.shape[1], edge_maps.shape[2]
         for row in range(height):
-            for word in range(edge_words.shape[2]):
-                bits = edge_words[view, row, word]
+            for word in range(mask_words.shape[2]):
+                bits = mask_words[view, row, word]
                 words[page, row, word, 0] = bits if background >= 0 else whole_word(word, width)
         draw_background(page, seed, background, width, height, words)
         slot = 0
         for row in range(height):
-            slot = list_row(page, view, row, width, slot, edge_maps, words)
+            slot = list_row(page, view, row, width, slot, edge_maps, starts, weights, words)
 
     @ti.kernel
     def select(
@@ -184,7 +226,9 @@ def make_select_pages(selection, threads):
         seeds: ti.types.ndarray(dtype=ti.u32, ndim=1),
         backgrounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
         edge_maps: ti.types.ndarray(dtype=ti.u8, ndim=3),
-        edge_words: ti.types.ndarray(dtype=ti.u32, ndim=3),
+        mask_words: ti.types.ndarray(dtype=ti.u32, ndim=3),
+        starts: ti.types.ndarray(dtype=ti.i32, ndim=2),
+        weights: ti.types.ndarray(dtype=ti.u8, ndim=1),
         words: ti.types.ndarray(dtype=ti.u32, ndim=4),
     ):
         for item in range(lanes * BLOCK):  # one block of items is one thread
@@ -192,12 +236,13 @@ def make_select_pages(selection, threads):
             for turn in range(turns):
                 page = item // BLOCK + turn * lanes
                 if page < count:
-                    fill_page(page, views[page], seeds[page], backgrounds[page], edge_maps, edge_words, words)
+                    view, seed, background = views[page], seeds[page], backgrounds[page]
+                    fill_page(page, view, seed, background, edge_maps, mask_words, starts, weights, words)
 
     return select
 
 
-def make_select_parallel(selection):
+def make_select_parallel(selection, level):
     """select for a GPU: as many threads as there are words, draws and rows, and no long loop in any of them.
 
     One thread for a page would go some 60 000 rounds one after the other; Mesa's software driver silently ends the
@@ -206,21 +251,21 @@ def make_select_parallel(selection):
     that of one draw after the other. A round leaves the share that is set already: of lines, five rounds leave nothing.
     """
     pages, height, width = selection.pages, selection.height, selection.width
-    list_row = make_list_row(selection, packed=True)
+    list_row = make_list_row(selection, True, level)
     row_counts = ti.field(ti.i32, shape=(pages, height))
     drawn, missing, found = (ti.field(ti.i32, shape=pages) for _ in range(3))  # draws made; pixels to find; those found
 
     @ti.kernel
-    def set_edges(
+    def set_mask(
         count: ti.i32,
         width: ti.i32,
         views: ti.types.ndarray(dtype=ti.i32, ndim=1),
         backgrounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        edge_words: ti.types.ndarray(dtype=ti.u32, ndim=3),
+        mask_words: ti.types.ndarray(dtype=ti.u32, ndim=3),
         words: ti.types.ndarray(dtype=ti.u32, ndim=4),
     ):
-        for page, row, word in ti.ndrange(count, edge_words.shape[1], edge_words.shape[2]):
-            bits = edge_words[views[page], row, word]
+        for page, row, word in ti.ndrange(count, mask_words.shape[1], mask_words.shape[2]):
+            bits = mask_words[views[page], row, word]
             words[page, row, word, 0] = bits if backgrounds[page] >= 0 else whole_word(word, width)
         for page in range(pages):
             drawn[page], found[page] = 0, 0
@@ -260,6 +305,8 @@ def make_select_parallel(selection):
         width: ti.i32,
         views: ti.types.ndarray(dtype=ti.i32, ndim=1),
         edge_maps: ti.types.ndarray(dtype=ti.u32, ndim=2),
+        starts: ti.types.ndarray(dtype=ti.i32, ndim=2),
+        weights: ti.types.ndarray(dtype=ti.u32, ndim=1),
         words: ti.types.ndarray(dtype=ti.u32, ndim=4),
     ):
         for page, row in ti.ndrange(count, words.shape[1]):
@@ -271,13 +318,13 @@ def make_select_parallel(selection):
             slot = 0
             for above in range(row):
                 slot += row_counts[page, above]
-            list_row(page, views[page], row, width, slot, edge_maps, words)
+            list_row(page, views[page], row, width, slot, edge_maps, starts, weights, words)
 
-    def select(count, views, seeds, backgrounds, edge_maps, edge_words, words):
-        set_edges(count, width, views, backgrounds, edge_words, words)
+    def select(count, views, seeds, backgrounds, edge_maps, mask_words, starts, weights, words):
+        set_mask(count, width, views, backgrounds, mask_words, words)
         longest = int(backgrounds.max())
         while longest > 0:
             longest = draw_missing(count, longest, width, seeds, words)
-        list_pixels(count, width, views, edge_maps, words)
+        list_pixels(count, width, views, edge_maps, starts, weights, words)
 
     return select

@@ -30,9 +30,10 @@ def make_compare(gaussians, cameras, target, selection, loss, threads, schedule)
     """compare(count, page, view, level, edge_weight, background_weight): Gaussians -> loss, for the tape.
 
     L_proj (eq. 3) of the pixels selected in `page`, of which `view` says where they are seen from: the sum of
-    weight * |C - target|, added to `loss` (0-D ndarray with gradient). level: target from which on a pixel has the
-    weight of an edge pixel. schedule: 'product' (a private plane for each of `threads` threads) or 'log' (atomic sums
-    of logarithms). The adjoint adds to the gradients of `gaussians` and to its positional gradients.
+    weight * |C - target|, added to `loss` (0-D ndarray with gradient). The weight is that of the pixel's class times
+    its own. level: target from which on a pixel has the class of an edge pixel. schedule: 'product' (a private plane
+    for each of `threads` threads) or 'log' (atomic sums of logarithms). The adjoint adds to the gradients of
+    `gaussians` and to its positional gradients.
     """
     draw = make_draw(gaussians, cameras, target, selection, threads, schedule)
     blend = make_blend(selection, schedule)
@@ -120,7 +121,7 @@ def make_blend(selection, schedule):
     """
     real = selection.real
     planes, transmittance, adjoint = selection.planes, selection.transmittance, selection.adjoint
-    targets, count = selection.targets, selection.planes.shape[0]
+    targets, weights, count = selection.targets, selection.weights, selection.planes.shape[0]
     empty = 0.0 if schedule == "log" else 1.0  # log T = 0 or T = 1
 
     @ti.kernel
@@ -139,7 +140,7 @@ def make_blend(selection, schedule):
         if ti.static(schedule == "log"):
             t = ti.exp(t)
         wanted = targets[page, slot]
-        weight = edge_weight if wanted >= level else background_weight
+        weight = weights[page, slot] * (edge_weight if wanted >= level else background_weight)
         difference = 1.0 - t - wanted
         side = 1.0 if difference > 0 else -1.0
         if difference == 0:

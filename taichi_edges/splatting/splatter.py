@@ -1,43 +1,68 @@
 """Splatter: the fields and kernels of one scene, and one view step through the tape."""
 
+from functools import partial
+
 import numpy as np
 import taichi as ti
 
+from taichi_edges.kernels.device import upload
+from taichi_edges.splatting.edge_weights import EdgeWeights, weigh_edge_pixels
 from taichi_edges.splatting.gaussians import GaussianFields, round_capacity
 from taichi_edges.splatting.losses import NeighborFields, make_regularizers
 from taichi_edges.splatting.optimizer import BETA1, BETA2, make_adam
 from taichi_edges.splatting.projection import CameraFields, SplatFields
 from taichi_edges.splatting.selection import WORD, PixelSelection, make_select, pack_mask
 from taichi_edges.splatting.splat import make_compare
+from taichi_edges.splatting.visibility import mask_with_flanks
 
 LOSSES = ("balanced", "class_weighted", "whole_image")  # eq. 3 first; the other two are the options the paper names
 GPU_ARCHS = ("cuda", "vulkan")
 MOST_ELEMENTS = 1 << 31  # of an array that a kernel is given: Taichi's indices are 32 bits wide
 PAGES = 16  # views whose pixels are selected in one launch
+LINE_FOOT = 0.011  # of full scale; from here on a pixel is one of a line: 3 standard deviations of its profile
 
 
 class EdgeImages:
-    """The edge maps as the kernels read them: maps and bit masks of their edge pixels.
+    """The edge maps as the kernels read them: maps, bit masks of their edge pixels, and what those weigh.
 
     On a CPU the kernels read the given u8 maps (V, H, W) where they are: a copy would double the largest thing in
     memory. A GPU gets a copy, view by view, four pixels in a u32: (V, H W / 4). Taichi would copy byte by byte.
+
+    mask_words, mask_counts: bit masks (V, H, W / 32) of the pixels that are selected for sure, and their numbers (V,):
+    to begin with the edge pixels, edge_words and edge_counts; line_words and line_counts with the flanks of the lines,
+    where those are wanted. weights: None, or EdgeWeights on the host; starts (V, H) and values (n,), in a u32 four of
+    them, are for the kernels.
     """
 
-    def __init__(self, edge_maps, threshold, on_gpu=False):
-        """edge_maps: (V, H, W) uint8. threshold: of full scale; from here on a pixel is an edge pixel."""
-        count, self.height, self.width = edge_maps.shape
+    def __init__(self, edge_maps, threshold, weigh=None, flanks=False, on_gpu=False):
+        """edge_maps: (V, H, W) uint8. threshold: of full scale; from here on a pixel is an edge pixel.
+
+        weigh: function (edge_maps, level) -> EdgeWeights, or None. flanks: whether they are wanted.
+        """
+        _, self.height, self.width = edge_maps.shape
         self.level = int(np.ceil(threshold * 255))
-        self.edge_counts = np.zeros(count, np.int64)
-        words = np.zeros((count, self.height, -(-self.width // WORD)), np.uint32)
-        for view, edge_map in enumerate(edge_maps):
-            edges = edge_map >= self.level
-            self.edge_counts[view] = np.count_nonzero(edges)
-            words[view] = pack_mask(edges)
+        words, self.edge_counts = bright_words(edge_maps, self.level)
         self.maps = _upload_maps(edge_maps) if on_gpu else np.ascontiguousarray(edge_maps)
-        self.words = words
-        if on_gpu:
-            self.words = ti.ndarray(ti.u32, shape=words.shape)
-            self.words.from_numpy(words)
+        self.edge_words = upload(words)
+        self.mask_words, self.mask_counts = self.line_words, self.line_counts = self.edge_words, self.edge_counts
+        if flanks:
+            words, self.line_counts = bright_words(edge_maps, min(int(np.ceil(LINE_FOOT * 255)), self.level))
+            self.line_words = upload(words)
+        self.weights = weigh(edge_maps, self.level) if weigh else None
+        weights = self.weights or EdgeWeights(np.zeros((1, 1), np.int32), np.zeros(1, np.uint8), None)
+        values = np.pad(weights.values, (0, -len(weights.values) % 4 or 4 * (len(weights.values) == 0)))
+        self.starts, self.values = upload(weights.starts), upload(values.view("<u4") if on_gpu else values)
+
+
+def bright_words(edge_maps, level):
+    """Bit masks (V, H, W / 32) uint32 of the pixels of (V, H, W) uint8 maps from `level` on, and their numbers (V,)."""
+    count, height, width = edge_maps.shape
+    words, counts = np.zeros((count, height, -(-width // WORD)), np.uint32), np.zeros(count, np.int64)
+    for view, edge_map in enumerate(edge_maps):
+        bright = edge_map >= level
+        counts[view] = np.count_nonzero(bright)
+        words[view] = pack_mask(bright)
+    return words, counts
 
 
 def _upload_maps(edge_maps):
@@ -65,7 +90,9 @@ class Splatter:
     """All that is needed to render and to optimise edge Gaussians against the edge maps of a scene.
 
     ti.init must have been called. edge_maps (V, H, W) uint8; intrinsics (V, 3, 3); world_to_camera (V, 3, 4).
-    threads: those Taichi was started with. schedule: 'product' for a CPU, 'log' for a GPU.
+    threads: those Taichi was started with. schedule: 'product' for a CPU, 'log' for a GPU. edgels: Edgels or None,
+    whose strengths make up the share `strength_weight` of what the edge pixels near them weigh in the loss. flanks:
+    whether `take_in_flanks` will be called.
     """
 
     def __init__(
@@ -80,19 +107,24 @@ class Splatter:
         threads=1,
         schedule="product",
         real=ti.f32,
+        edgels=None,
+        strength_weight=0.0,
+        flanks=False,
     ):
-        assert loss in LOSSES, loss
+        assert loss in LOSSES and (loss == "balanced" or not flanks), loss
         self.loss_mode, self.threads, self.schedule, self.real = loss, threads, schedule, real
-        self.images = EdgeImages(edge_maps, edge_threshold, on_gpu=schedule == "log")
+        weighted = edgels is not None and strength_weight > 0
+        weigh = partial(weigh_edge_pixels, edgels=edgels, share=strength_weight) if weighted else None
+        self.images = EdgeImages(edge_maps, edge_threshold, weigh, flanks, on_gpu=schedule == "log")
+        self.projections = np.asarray(intrinsics) @ np.asarray(world_to_camera)
         self.cameras = CameraFields(np.asarray(intrinsics), np.asarray(world_to_camera), real)
-        height, width = self.images.height, self.images.width
-        balanced = loss == "balanced"
-        most = min(2 * int(self.images.edge_counts.max()), height * width) if balanced else height * width
-        slots = round_capacity(most)
+        height, width, balanced = self.images.height, self.images.width, loss == "balanced"
+        most = int((self.images.edge_counts + self.images.line_counts).max()) if balanced else height * width
+        slots = round_capacity(min(most, height * width))
         pages, planes = PAGES if balanced else 1, threads if schedule == "product" else 1
         self.selection = PixelSelection(height, width, slots, pages, planes, real)
         self.loss = ti.ndarray(real, shape=(), needs_grad=True)  # a field would take the tape two launches to reset
-        self._select = make_select(self.selection, threads, schedule)
+        self._select = make_select(self.selection, threads, schedule, self.images.level if weighted else None)
         self._neighbor_count = neighbors
         self._allocate(round_capacity(capacity))
 
@@ -120,28 +152,46 @@ class Splatter:
         images, selection = self.images, self.selection
         views, seeds = np.atleast_1d(views).astype(np.int32), np.atleast_1d(seeds).astype(np.uint32)
         pixel_count = images.height * images.width
-        edges = images.edge_counts[views]
         if self.loss_mode == "balanced":
-            backgrounds = np.minimum(edges, pixel_count - edges)
-            selection.counts[: len(views)] = edges + backgrounds
-            backgrounds[edges + backgrounds == pixel_count] = -1  # all of them: nothing to draw
+            masked = images.mask_counts[views]
+            backgrounds = np.minimum(images.edge_counts[views], pixel_count - masked)
+            selection.counts[: len(views)] = masked + backgrounds
+            backgrounds[masked + backgrounds == pixel_count] = -1  # all of them: nothing to draw
         else:
             backgrounds = np.full(len(views), -1)
             selection.counts[: len(views)] = pixel_count
         selection.views[: len(views)] = views
-        maps, words = images.maps, images.words
+        maps, words, starts = images.maps, images.mask_words, images.starts
         if isinstance(maps, np.ndarray) and maps.size >= MOST_ELEMENTS:
-            maps, words, views = maps[views], words[views], np.arange(len(views), dtype=np.int32)
-        self._select(len(views), views, seeds, backgrounds.astype(np.int32), maps, words, selection.words)
+            maps, words = maps[views], words[views]
+            starts = starts[views] if images.weights else starts
+            views = np.arange(len(views), dtype=np.int32)
+        inputs = (maps, words, starts, images.values, selection.words)
+        self._select(len(views), views, seeds, backgrounds.astype(np.int32), *inputs)
         return selection.counts[: len(views)]
 
+    def take_in_flanks(self, points):
+        """From the next selection on, the flanks of the lines are in the mask (see `visibility`).
+
+        points: (n, 3) unit cube, on edges that are known to be there: where one of them is hidden, flanks are not.
+        """
+        images = self.images
+        masks = mask_with_flanks(images.edge_words, images.line_words, images.width, self.projections, points)
+        images.mask_words, images.mask_counts = masks
+
     def weights(self, page):
-        """Weights of an edge pixel and of a background pixel of a page in the loss."""
+        """What the own weights of the edge pixels and of the background pixels of a page are multiplied by in the loss.
+
+        Edge pixels weigh so much on average: the balance of edges and background is that of pixels that weigh alike.
+        """
         pixel_count = self.images.height * self.images.width
-        edges = int(self.images.edge_counts[self.selection.views[page]])
+        view = int(self.selection.views[page])
+        edges = int(self.images.edge_counts[view])
+        edge_weight = background_weight = 1.0 / max(int(self.selection.counts[page]), 1)
         if self.loss_mode == "class_weighted":
-            return 0.5 / max(edges, 1), 0.5 / max(pixel_count - edges, 1)
-        return (1.0 / max(int(self.selection.counts[page]), 1),) * 2
+            edge_weight, background_weight = 0.5 / max(edges, 1), 0.5 / max(pixel_count - edges, 1)
+        mean = self.images.weights.means[view] if self.images.weights else 1.0
+        return float(edge_weight / mean), background_weight
 
     def draw(self, page=0):
         """Transmittance at the pixels selected in `page`, and their loss, added to what is there."""

@@ -11,8 +11,10 @@ from taichi_edges.splatting import density
 from taichi_edges.splatting.density import Population
 from taichi_edges.splatting.gaussians import Gaussians, logit
 from taichi_edges.splatting.splatter import GPU_ARCHS, Splatter
+from taichi_edges.support import exclusive_support
 
 SETTLED_PASSES = 2  # over the views; the pixels drawn anew make the loss of a single pass uncertain by 0.7 %
+ESTABLISHED_OPACITY = 0.2  # fainter ones are in no result: the least of the filters
 LOG_STEPS = 50  # view steps between two lines of the training log
 
 
@@ -90,6 +92,9 @@ class Training:
             neighbors=config.neighbors,
             threads=threads,
             schedule="log" if arch in GPU_ARCHS else "product",
+            edgels=views.edgels,
+            strength_weight=config.strength_weight,
+            flanks=config.takes_in_flanks,
         )
         self.visited = self._views_with_pixels()
         # A length in steps is enough for a few hundred views; of more, every one is seen once.
@@ -176,6 +181,11 @@ class Training:
         ):
             for step in sorted({max(round(share * self.total), 1) for share in shares}):
                 actions.setdefault(step, []).append(action)
+        if self.config.takes_in_flanks:
+            first = max(round(self.config.flanks_from * self.total), 1)
+            culls = {max(round(share * self.total), 1) for share in config.cull_support_at}
+            for step in sorted({first, *(step for step in culls if step > first)}):
+                actions.setdefault(step, []).append(self._take_in_flanks)
         return actions
 
     def _control_density(self, step):
@@ -209,6 +219,16 @@ class Training:
 
     def _cull_opacity(self, population):
         return self._limit_opacity(density.cull_opacity(population, self.config.density.min_opacity))
+
+    def _take_in_flanks(self, population):
+        """The mask with the flanks of the lines, except where an edge that other views have established is hidden."""
+        config, gaussians = self.config, population.gaussians
+        points = np.zeros((0, 3))
+        if config.established_support > 0:
+            points = gaussians.means[gaussians.opacities >= ESTABLISHED_OPACITY].astype(np.float64)
+            points = points[exclusive_support(self.views, points, config.edge_threshold) >= config.established_support]
+        self.splatter.take_in_flanks(points)
+        return population
 
     def _limit_opacity(self, population):
         """Opacities down to the initial one after a cull, so that the survivors must earn theirs again (as in 3DGS)."""
