@@ -295,7 +295,7 @@ PRESETS = {
             "initial_opacity": 0.3,
             "loss": "balanced",
             "strength_weight": 0.5,
-            "flanks_from": 0.5,
+            "flanks_from": 1.0,
             "established_support": 0.1,
             "only_means": 0.15,
             "learning_rates": {"means": 2e-3, "scales": 5e-3, "opacities": 3e-2, "quaternions": 5e-3},
