@@ -46,10 +46,17 @@ class Cloud:
     def __init__(self, points, directions, scale, tree=None):
         self.points, self.directions, self.scale = points, directions, scale
         self.tree = cKDTree(points) if tree is None else tree
+        self.noises = np.full(len(points), scale.noise)
 
     def at_scale(self, scale):
         """The same points with another Scale."""
         return Cloud(self.points, self.directions, scale, self.tree)
+
+    def with_noises(self, noises):
+        """The same points, each with a noise of its own: (n,), unit-cube units."""
+        cloud = self.at_scale(self.scale)
+        cloud.noises = noises
+        return cloud
 
     def near(self, arc, low, high):
         """Indices of the points about the arc between two arc lengths; some farther ones are among them."""
@@ -76,7 +83,7 @@ def grow_arc(cloud, start, straight):
     for _ in range(GROWTH_ROUNDS):
         ahead = min(max(GROWTH * arc.length, 3 * scale.noise), scale.gap)
         members, along, squared = cloud.inliers(arc, arc.low - ahead, arc.high + ahead)
-        inside = unbroken(along, arc.low, arc.high, ahead, arc.round)
+        inside = unbroken(along, arc.low, arc.high, ahead)
         members, along, squared = members[inside], along[inside], squared[inside]
         if len(members) < START_POINTS:
             return best
@@ -92,7 +99,7 @@ def grow_arc(cloud, start, straight):
     return best
 
 
-def unbroken(along, low, high, gap, round_):
+def unbroken(along, low, high, gap):
     """(n,) bool: the points reached from the stretch low..high without a step longer than `gap`."""
     order = np.argsort(along, kind="stable")
     sorted_along = along[order]

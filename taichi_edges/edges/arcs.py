@@ -123,19 +123,19 @@ def _versine(along, bent):
     return 2 * (np.sin(0.5 * bent * along) / bent) ** 2 if bent > FLAT else 0.5 * along**2
 
 
-def fit_arc(arc, points, directions, lever, tolerance, straight, rounds=GAUSS_NEWTON):
+def fit_arc(arc, points, directions, lever, tolerance, straight, rounds=GAUSS_NEWTON, shares=1.0):
     """The arc moved, turned and bent to the points: robust Gauss-Newton; its ends are kept.
 
     arc: a start that is near. points, directions: (n, 3). lever: noise of the points over that of the directions,
     unit-cube units: how much a direction tells, compared with a place. tolerance: distance at which a point's weight
-    has fallen to a quarter. straight: fit a line; the bend is dropped.
+    has fallen to a quarter. straight: fit a line; the bend is dropped. shares: (n,) weights of the points, or 1.
     """
     if straight:
         arc = replace(arc, bend=np.zeros(3))
     for _ in range(rounds):
         along, offsets = arc.coordinates(points)
         tangent, inward, normal = arc.frame
-        weights = 1.0 / (1.0 + (offsets**2).sum(axis=1) / tolerance**2) ** 2
+        weights = shares / (1.0 + (offsets**2).sum(axis=1) / tolerance**2) ** 2
         bent, terms = arc.curvature, 2 if straight else 3
         cosine, sine = np.cos(bent * along), _sine(along, bent)
         values = np.stack([np.ones_like(along), sine, _versine(along, bent)][:terms])

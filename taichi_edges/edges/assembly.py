@@ -52,14 +52,14 @@ def assemble(points, directions, config):
     follows = (graph.indices >= 0) & (aligned >= config.theta)
     neighbors = [row[good] for row, good in zip(graph.indices, follows, strict=True)]
     cloud = Cloud(points, directions, measured_scale(points, directions, neighbors, seeds, config.max_gap))
-    found, owner = claims(cloud, neighbors, seeds, config.min_points)
-    pieces = merged(cloud, found)
+    found, ledger = claims(cloud, neighbors, seeds, config.min_points)
+    pieces = merged(cloud, found, ledger.noise)
     labels, shared = np.full(len(points), UNASSIGNED), [np.zeros((0, 2), int)]
     for number, piece in enumerate(pieces):
         labels[piece.own] = number
         shared.append(np.stack([piece.shared, np.full(len(piece.shared), number)], axis=1))
     arcs = np.array([pack_arc(piece.arc) for piece in pieces]).reshape(-1, ARC_NUMBERS)
-    left = left_over(cloud, owner, config)
+    left = left_over(cloud, ledger.owner, config)
     labels = np.where(left >= 0, left + len(pieces), labels)
     free = np.full((left.max() + 1, ARC_NUMBERS), np.nan)
     return Assembly(labels, np.concatenate(shared), np.concatenate([arcs, free]))

@@ -7,17 +7,20 @@ closed circle, and the points that remain are the other edges. Points at a conta
 """
 
 import heapq
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from taichi_edges.edges.arc_growth import INLIER, Cloud, bent_from, grown_from_neighbors
-from taichi_edges.edges.arcs import Arc
+from taichi_edges.edges.arc_growth import INLIER, Cloud, bent_from, grown_from_neighbors, unbroken
+from taichi_edges.edges.arcs import Arc, fit_arc
 
 OUTLIER = INLIER**2  # squared noises: what a point on an edge brings at most
 LINE_PRICE, ARC_PRICE = 5, 8  # free parameters: a line and where it ends; an arc, which has a plane and a bend as well
 OWN_SHARE = 0.5  # of the points along a stretch, which must be an arc's own: elsewhere it repeats another
 COVERED = 2.0  # noises: a point so near to what has grown from another seed needs no growth of its own
+ROUNDS, COARSER = 3, 2.0  # of claiming, and from the noise of one to that of the next
+MOST_NOISE = 2e-3  # unit-cube units; coarser rounds would claim neighbouring edges (the paper's lines take 5e-3)
+TAIL = 0.7  # of the gap: an edge goes on past its sharp points in steps of that size at most
 
 
 @dataclass(frozen=True)
@@ -34,17 +37,42 @@ class Claim:
         return np.concatenate([self.own, self.shared])
 
 
+class Ledger:
+    """Who owns each point, (n,) ints, -1 for nobody; and the noise at which it was claimed, (n,) unit-cube units."""
+
+    def __init__(self, count):
+        self.owner, self.noise = np.full(count, -1), np.full(count, np.inf)
+
+    def enter(self, members, owner, noise):
+        """The points in `members` now belong to `owner`."""
+        self.owner[members], self.noise[members] = owner, noise
+
+
 def claims(cloud, neighbors, seeds, min_points):
-    """Claims of lines and arcs that own disjoint points, best supported first; and (n,) who owns each point, or -1.
+    """Claims of lines and arcs that own disjoint points; and the Ledger that says so.
 
     neighbors: for every point its aligned neighbours, an index array. seeds: (n,) indices, best first.
+    Edges that few views see are noisier than others. Their turn comes when the sharp ones have their points: in every
+    round the tolerance is COARSER times that of the round before, and what is found already grows first.
     """
-    owner = np.full(len(cloud.points), -1)
-    waiting = []
-    for number, arc in enumerate(candidates(cloud, neighbors, seeds, min_points)):
+    ledger, found, finest = Ledger(len(cloud.points)), [], cloud.scale.noise
+    for number in range(ROUNDS):
+        noise = finest * COARSER**number
+        if number and noise > MOST_NOISE:
+            break
+        cloud = cloud.at_scale(replace(cloud.scale, noise=noise))
+        found = [widened(cloud, claim, ledger, k, beyond=0.0) for k, claim in enumerate(found)]
+        claim_round(cloud, neighbors, seeds[ledger.owner[seeds] < 0], min_points, ledger, found)
+        found = [widened(cloud, claim, ledger, k, beyond=TAIL * cloud.scale.gap) for k, claim in enumerate(found)]
+    return [refined(cloud, claim, ledger) for claim in found], ledger
+
+
+def claim_round(cloud, neighbors, seeds, min_points, ledger, found):
+    """Add to the Claims in `found`, and to the Ledger, what can be claimed at the cloud's scale."""
+    waiting, owner = [], ledger.owner
+    for number, arc in enumerate(candidates(cloud, neighbors, seeds, min_points, owner)):
         gain, _ = supported(cloud, arc, owner, min_points)
         heapq.heappush(waiting, (-gain, number, arc))
-    found = []
     while waiting:
         _, number, arc = heapq.heappop(waiting)
         gain, claim = supported(cloud, arc, owner, min_points)
@@ -53,22 +81,51 @@ def claims(cloud, neighbors, seeds, min_points):
         if waiting and gain < -waiting[0][0]:  # others have claimed its points: let it wait for its new turn
             heapq.heappush(waiting, (-gain, number, arc))
             continue
-        owner[claim.own] = len(found)
+        ledger.enter(claim.own, len(found), cloud.scale.noise)
         found.append(claim)
-    return found, owner
 
 
-def candidates(cloud, neighbors, seeds, min_points):
-    """Arcs grown from seeds until every point is near one, or has grown none."""
-    covered = np.zeros(len(cloud.points), bool)
-    nobody = np.full(len(cloud.points), -1)
+def widened(cloud, claim, ledger, number, beyond):
+    """The Claim with the points that nobody owns and that lie on it at the cloud's scale; the Ledger is told.
+
+    beyond: how far it may go on past its ends, without a longer step, unit-cube units.
+    """
+    arc = claim.arc
+    reach = 0.0 if arc.closed else cloud.scale.gap * (beyond > 0)
+    members, along, _ = cloud.inliers(arc, arc.low - reach, arc.high + reach)
+    free = ledger.owner[members] < 0
+    members, along = members[free], along[free]
+    if beyond and not arc.closed and len(members):
+        stations = np.concatenate([along, np.linspace(arc.low, arc.high, int(arc.length / beyond) + 2)])
+        good = unbroken(stations, arc.low, arc.high, beyond)[: len(along)]
+        members, along = members[good], along[good]
+    if not len(members):
+        return claim
+    ledger.enter(members, number, cloud.scale.noise)
+    ends = (arc.low, arc.high) if arc.closed else (min(arc.low, along.min()), max(arc.high, along.max()))
+    return Claim(arc.over(*ends), np.union1d(claim.own, members), np.setdiff1d(claim.shared, members))
+
+
+def refined(cloud, claim, ledger):
+    """The Claim with its arc fitted once more to all of its points, each as sharply as it was claimed."""
+    members, noises = claim.members, ledger.noise[claim.members]
+    places, directions = cloud.points[members], cloud.directions[members]
+    shares, tolerance = (noises.min() / noises) ** 2, INLIER * noises.max()
+    arc = claim.arc.recentred()
+    arc = fit_arc(arc, places, directions, cloud.scale.lever, tolerance, arc.curvature == 0, shares=shares)
+    return Claim(arc, claim.own, claim.shared)
+
+
+def candidates(cloud, neighbors, seeds, min_points, owner):
+    """Arcs grown from seeds until every point that nobody owns is near one, or has grown none."""
+    covered = owner >= 0
     for seed in seeds:
         if covered[seed]:
             continue
         covered[seed] = True
         line = grown_from_neighbors(cloud, neighbors, seed, straight=True)
         arc = grown_from_neighbors(cloud, neighbors, seed, straight=False) if line is None else bent_from(cloud, line)
-        grown = [(arc, supported(cloud, arc, nobody, min_points)[0]) for arc in (line, arc) if arc is not None]
+        grown = [(arc, supported(cloud, arc, owner, min_points)[0]) for arc in (line, arc) if arc is not None]
         grown = [(arc, gain) for arc, gain in grown if gain > 0]
         if not grown:
             continue

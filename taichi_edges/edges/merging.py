@@ -6,6 +6,7 @@ claimed by several arcs is one cubic; a fillet between two lines stays three edg
 """
 
 import heapq
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,20 +72,24 @@ class Piece:
         return self.along * scale, np.array([0.0, len(self.curves)]) * scale
 
 
-def merged(cloud, claims):
-    """Pieces of whole edges from Claims, see `claiming`. cloud: Cloud."""
+def merged(cloud, claims, noises):
+    """Pieces of whole edges from Claims, see `claiming`.
+
+    cloud: Cloud. noises: (n,) at which each point was claimed, unit-cube units.
+    """
+    cloud = cloud.with_noises(noises)
     pieces = {number: piece_of(cloud, claim.arc, claim.own, claim.shared) for number, claim in enumerate(claims)}
-    waiting, count = [], len(pieces)
+    waiting, turns, count = [], itertools.count(), len(pieces)
 
     def propose(some):
         for a, b in joints(cloud, pieces, some):
             gain, piece = joined(cloud, pieces[a[0]], pieces[b[0]], a[1], b[1])
             if gain > 0:
-                heapq.heappush(waiting, (-gain, a[0], b[0], piece))
+                heapq.heappush(waiting, (-gain, a[0], b[0], next(turns), piece))
 
     propose(set(pieces))
     while waiting:
-        _, a, b, piece = heapq.heappop(waiting)
+        _, a, b, _, piece = heapq.heappop(waiting)
         if a in pieces and b in pieces:
             del pieces[a], pieces[b]
             pieces[count] = piece
@@ -97,13 +102,13 @@ def piece_of(cloud, arc, own, shared):
     """The Piece of an arc and its points."""
     members = np.concatenate([own, shared])
     along, offsets = arc.coordinates(cloud.points[members])
-    cost = capped((offsets**2).sum(axis=1), cloud.scale) + price(arc) * np.log(len(members))
+    cost = capped((offsets**2).sum(axis=1), cloud.noises[members]) + price(arc) * np.log(len(members))
     return Piece(arc, None, own, shared, along, cost)
 
 
-def capped(squared, scale):
-    """Sum of (n,) squared distances in units of the noise, each at most OUTLIER."""
-    return float(np.minimum(squared / scale.noise**2, OUTLIER).sum())
+def capped(squared, noises):
+    """Sum of (n,) squared distances in units of the noises, (n,), each at most OUTLIER."""
+    return float(np.minimum(squared / noises**2, OUTLIER).sum())
 
 
 def joints(cloud, pieces, some):
@@ -136,32 +141,34 @@ def joined(cloud, a, b, end_a, end_b):
 def arc_piece(cloud, start, own, shared, straight):
     """The points of two pieces as one line or arc; None where it bends too little for an arc."""
     members, scale = np.concatenate([own, shared]), cloud.scale
-    points, directions = cloud.points[members], cloud.directions[members]
+    points, directions, noises = cloud.points[members], cloud.directions[members], cloud.noises[members]
+    shares = (noises.min() / noises) ** 2
     for tolerance in (WIDE * INLIER, INLIER):
-        start = fit_arc(start, points, directions, scale.lever, tolerance * scale.noise, straight)
+        start = fit_arc(start, points, directions, scale.lever, tolerance * noises.max(), straight, shares=shares)
     along, offsets = start.coordinates(points)
-    good = (offsets**2).sum(axis=1) <= OUTLIER * scale.noise**2
+    good = (offsets**2).sum(axis=1) <= OUTLIER * noises**2
     if good.sum() < 2:
         return None
     arc = start.over(along[good].min(), along[good].max())
     if arc.length + scale.gap >= arc.round:
         arc = arc.over(arc.low, arc.low + arc.round)
-    if not straight and sagitta(arc) < SAGITTA * scale.noise:
+    if not straight and sagitta(arc) < SAGITTA * noises.min():
         return None
     return piece_of(cloud, arc.recentred(), own, shared)
 
 
 def free_piece(cloud, a, b, end_a, end_b, own, shared):
     """The points of two pieces as a smooth chain of as few cubics as pay; see `joined`."""
-    points = cloud.points[np.concatenate([own, shared])]
-    ordering = chained(cloud, a, b, end_a, end_b, np.concatenate([own, shared]))
+    members = np.concatenate([own, shared])
+    points, noises = cloud.points[members], cloud.noises[members]
+    ordering = chained(cloud, a, b, end_a, end_b, members)
     best, most = None, min(a.cubics + b.cubics, MOST_CUBICS)
     for cubics in range(1, most + 1):
         if len(points) < 6 * cubics:
             break
-        curves, _ = fit_chain(points, ordering, INLIER * cloud.scale.noise, cubics)
+        curves, _ = fit_chain(points, ordering, INLIER * noises.max(), cubics)
         distances, along = nearest_on_chain(points, curves)
-        cost = (CUBIC_PRICE + NEXT_CUBIC_PRICE * (cubics - 1)) * np.log(len(points)) + capped(distances**2, cloud.scale)
+        cost = (CUBIC_PRICE + NEXT_CUBIC_PRICE * (cubics - 1)) * np.log(len(points)) + capped(distances**2, noises)
         if best is None or cost < best.cost:
             best = Piece(None, curves, own, shared, along, cost)
     return best
