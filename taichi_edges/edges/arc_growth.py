@@ -1,5 +1,6 @@
 """Lines and circular arcs grown over oriented points, as far as places and directions agree."""
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,8 +32,8 @@ class Scale:
 
     @property
     def lever(self):
-        """Noise of the points over that of the directions."""
-        return self.noise / self.turn
+        """Noise of the points over that of the directions: on a stretch as short as that, directions tell more."""
+        return min(self.noise / self.turn, self.gap)
 
     @property
     def cosine(self):
@@ -61,11 +62,11 @@ class Cloud:
     def near(self, arc, low, high):
         """Indices of the points about the arc between two arc lengths; some farther ones are among them."""
         high = min(high, low + arc.round)
-        reach = self.scale.gap
-        samples = arc.at(np.linspace(low, high, int((high - low) / reach) + 2))
-        radius = np.hypot(0.5 * reach, INLIER * self.scale.noise) + 1e-9
-        found = self.tree.query_ball_point(samples, radius)
-        return np.unique(np.concatenate([np.asarray(part, dtype=np.int64) for part in found]))
+        count = int((high - low) / self.scale.gap) + 1
+        step = (high - low) / count
+        radius = np.hypot(0.5 * step, INLIER * self.scale.noise) * (1 + 1e-9)
+        found = self.tree.query_ball_point(arc.at(low + step * (np.arange(count) + 0.5)), radius)
+        return np.unique(np.fromiter(itertools.chain.from_iterable(found), np.int64))
 
     def inliers(self, arc, low, high):
         """Indices, arc lengths and squared residuals (noises) of the points on the arc between two arc lengths."""
@@ -81,9 +82,9 @@ def grow_arc(cloud, start, straight):
     """The longest unbroken line or arc that `start`, an Arc with points along it, is a part of, or None."""
     scale, arc, best = cloud.scale, start, None
     for _ in range(GROWTH_ROUNDS):
-        ahead = min(max(GROWTH * arc.length, 3 * scale.noise), scale.gap)
+        ahead = max(GROWTH * arc.length, INLIER * scale.noise)
         members, along, squared = cloud.inliers(arc, arc.low - ahead, arc.high + ahead)
-        inside = unbroken(along, arc.low, arc.high, ahead)
+        inside = unbroken(along, arc.low, arc.high, min(ahead, scale.gap))
         members, along, squared = members[inside], along[inside], squared[inside]
         if len(members) < START_POINTS:
             return best
@@ -92,7 +93,7 @@ def grow_arc(cloud, start, straight):
         if arc.length + scale.gap >= arc.round:
             arc = arc.over(arc.low, arc.low + arc.round)
         places, directions = cloud.points[members], cloud.directions[members]
-        arc = fit_arc(arc.recentred(), places, directions, scale.lever, INLIER * scale.noise, straight, 1)
+        arc = fit_arc(arc.recentred(), places, directions, 0.0, INLIER * scale.noise, straight, 1)
         if best is not None and arc.length <= GROWN * before:
             return arc
         best = arc
@@ -133,7 +134,8 @@ def refitted(cloud, start, members, straight):
     """A line or an arc fitted to some points and grown from there, or None where that bends too little for an arc."""
     scale = cloud.scale
     places, directions = cloud.points[members], cloud.directions[members]
-    start = fit_arc(start, places, directions, scale.lever, INLIER * scale.noise, straight)
+    lever = scale.lever if straight or start.length < scale.gap else 0.0  # on longer stretches the places tell more
+    start = fit_arc(start, places, directions, lever, INLIER * scale.noise, straight)
     arc = grow_arc(cloud, start, straight)
     bends = arc is not None and sagitta(arc) >= SAGITTA * scale.noise
     return arc if straight or bends else None

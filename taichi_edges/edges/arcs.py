@@ -52,7 +52,7 @@ class Arc:
         else:
             inward = cross(self.tangent, np.eye(3)[np.argmin(np.abs(self.tangent))])
             inward /= np.sqrt(inward @ inward)
-        return np.stack([self.tangent, inward, cross(self.tangent, inward)])
+        return np.array([self.tangent, inward, cross(self.tangent, inward)])
 
     def coordinates(self, points):
         """(n,) arc lengths of the nearest places, and (n, 2) offsets from these: inward, and along the plane's normal.

@@ -17,7 +17,7 @@ from taichi_edges.edges.arcs import Arc, fit_arc
 OUTLIER = INLIER**2  # squared noises: what a point on an edge brings at most
 LINE_PRICE, ARC_PRICE = 5, 8  # free parameters: a line and where it ends; an arc, which has a plane and a bend as well
 OWN_SHARE = 0.5  # of the points along a stretch, which must be an arc's own: elsewhere it repeats another
-COVERED = 2.0  # noises: a point so near to what has grown from another seed needs no growth of its own
+COVERED = 2.5  # noises: a point so near to what has grown from another seed needs no growth of its own
 ROUNDS, COARSER = 3, 2.0  # of claiming, and from the noise of one to that of the next
 MOST_NOISE = 2e-3  # unit-cube units; coarser rounds would claim neighbouring edges (the paper's lines take 5e-3)
 TAIL = 0.7  # of the gap: an edge goes on past its sharp points in steps of that size at most
@@ -112,7 +112,7 @@ def refined(cloud, claim, ledger):
     places, directions = cloud.points[members], cloud.directions[members]
     shares, tolerance = (noises.min() / noises) ** 2, INLIER * noises.max()
     arc = claim.arc.recentred()
-    arc = fit_arc(arc, places, directions, cloud.scale.lever, tolerance, arc.curvature == 0, shares=shares)
+    arc = fit_arc(arc, places, directions, 0.0, tolerance, arc.curvature == 0, shares=shares)
     return Claim(arc, claim.own, claim.shared)
 
 
@@ -125,15 +125,14 @@ def candidates(cloud, neighbors, seeds, min_points, owner):
         covered[seed] = True
         line = grown_from_neighbors(cloud, neighbors, seed, straight=True)
         arc = grown_from_neighbors(cloud, neighbors, seed, straight=False) if line is None else bent_from(cloud, line)
-        grown = [(arc, supported(cloud, arc, owner, min_points)[0]) for arc in (line, arc) if arc is not None]
-        grown = [(arc, gain) for arc, gain in grown if gain > 0]
-        if not grown:
-            continue
-        best = max(grown, key=lambda pair: pair[1])[0]
-        members, _, squared = cloud.inliers(best, best.low, best.high)
-        covered[members[squared <= COVERED**2]] = True
-        for arc, _ in grown:
-            yield arc
+        grown = [arc for arc in (line, arc) if arc is not None]
+        gains = [supported(cloud, arc, owner, min_points)[0] for arc in grown]
+        for arc, gain in zip(grown, gains, strict=True):
+            if gain == max(gains):  # even where it is too short to be claimed: its points will not do better
+                members, _, squared = cloud.inliers(arc, arc.low, arc.high)
+                covered[members[squared <= COVERED**2]] = True
+            if gain > 0:
+                yield arc
 
 
 def supported(cloud, arc, owner, min_points):

@@ -144,7 +144,7 @@ def arc_piece(cloud, start, own, shared, straight):
     points, directions, noises = cloud.points[members], cloud.directions[members], cloud.noises[members]
     shares = (noises.min() / noises) ** 2
     for tolerance in (WIDE * INLIER, INLIER):
-        start = fit_arc(start, points, directions, scale.lever, tolerance * noises.max(), straight, shares=shares)
+        start = fit_arc(start, points, directions, 0.0, tolerance * noises.max(), straight, shares=shares)
     along, offsets = start.coordinates(points)
     good = (offsets**2).sum(axis=1) <= OUTLIER * noises**2
     if good.sum() < 2:
