@@ -23,12 +23,13 @@ class Scale:
     """What the points themselves say about distances; unit-cube units and radians.
 
     noise: standard deviation of the points across their edge, on each of its two axes. turn: the same of directions.
-    gap: points of an edge are no farther apart.
+    gap: points of an edge are no farther apart. spread: times the tolerance of directions is wider for coarser edges.
     """
 
     noise: float
     turn: float
     gap: float
+    spread: float = 1.0
 
     @property
     def lever(self):
@@ -38,7 +39,7 @@ class Scale:
     @property
     def cosine(self):
         """A point whose direction is off by more is on another edge."""
-        return float(np.cos(np.clip(DIRECTION_NOISES * self.turn, *TURNS)))
+        return float(np.cos(np.clip(self.spread * max(DIRECTION_NOISES * self.turn, TURNS[0]), *TURNS)))
 
 
 class Cloud:

@@ -60,7 +60,7 @@ def claims(cloud, neighbors, seeds, min_points):
         noise = finest * COARSER**number
         if number and noise > MOST_NOISE:
             break
-        cloud = cloud.at_scale(replace(cloud.scale, noise=noise))
+        cloud = cloud.at_scale(replace(cloud.scale, noise=noise, spread=COARSER**number))
         found = [widened(cloud, claim, ledger, k, beyond=0.0) for k, claim in enumerate(found)]
         claim_round(cloud, neighbors, seeds[ledger.owner[seeds] < 0], min_points, ledger, found)
         found = [widened(cloud, claim, ledger, k, beyond=TAIL * cloud.scale.gap) for k, claim in enumerate(found)]
@@ -140,38 +140,42 @@ def supported(cloud, arc, owner, min_points):
 
     A stretch counts where most points along it are its own. Shared points carry it across a contact, no farther.
     """
-    scale = cloud.scale
     members, along, squared = cloud.inliers(arc, arc.low, arc.high)
     own = owner[members] < 0
     if own.sum() < min_points:
         return 0.0, None
-    kept = _own_stretches(along, own, scale.gap, arc)
+    kept = _own_stretches(along, own, cloud.scale.gap)
     own &= kept
-    count = int(own.sum())
-    if count < min_points:
+    if own.sum() < min_points:
         return 0.0, None
-    gain = (OUTLIER - squared[own]).sum() - price(arc) * np.log(max(len(members), 2))
-    low, high = along[own].min(), along[own].max()
-    if not (arc.closed and own.all()):
-        inside = (along >= low) & (along <= high)
-    else:
-        inside = np.ones(len(along), bool)
-    whole = arc if arc.closed else arc.over(low, high)
-    return gain, Claim(whole, members[own], members[~own & inside])
+    gain = (OUTLIER - squared[own]).sum() - price(arc) * np.log(len(members))
+    whole = arc if arc.closed and own.mean() >= OWN_SHARE else arc.over(along[kept].min(), along[kept].max())
+    return gain, Claim(whole, members[own], members[kept & ~own])
 
 
-def _own_stretches(along, own, gap, arc):
-    """(n,) bool: points of the stretches, between gaps in the own points, in which these are the majority."""
+def _own_stretches(along, own, gap):
+    """(n,) bool: the points of an arc's own stretches and between them.
+
+    A stretch lies between gaps in the own points, and these are the majority of its points. Stretches are one where
+    shared points join them, over no more than the length of the two: else the arc repeats another one.
+    """
     order = np.argsort(along, kind="stable")
-    mine = order[own[order]]
-    run = np.concatenate([[0], np.cumsum(np.diff(along[mine]) > gap)])
-    kept = np.zeros(len(along), bool)
-    for number in range(run[-1] + 1):
-        part = mine[run == number]
-        inside = (along >= along[part[0]]) & (along <= along[part[-1]])
-        if own[inside].mean() >= OWN_SHARE:
-            kept[inside] = True
-    return kept
+    mine = along[order[own[order]]]
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(mine) > gap]))
+    lows, highs = mine[starts], mine[np.append(starts[1:], len(mine)) - 1]
+    first, last = np.searchsorted(along[order], lows), np.searchsorted(along[order], highs, side="right")
+    owned = np.concatenate([[0], np.cumsum(own[order])])
+    good = owned[last] - owned[first] >= OWN_SHARE * (last - first)
+    spans = []
+    for low, high in zip(lows[good], highs[good], strict=True):
+        if spans and low - spans[-1][1] <= high - low + spans[-1][2]:
+            spans[-1] = (spans[-1][0], high, spans[-1][2] + high - low)
+        else:
+            spans.append((low, high, high - low))
+    if not spans:
+        return np.zeros(len(along), bool)
+    low, high, _ = max(spans, key=lambda span: span[2])
+    return (along >= low) & (along <= high)
 
 
 def price(arc):
