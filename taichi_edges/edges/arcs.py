@@ -138,11 +138,13 @@ def fit_arc(arc, points, directions, lever, tolerance, straight, rounds=GAUSS_NE
         weights = shares / (1.0 + (offsets**2).sum(axis=1) / tolerance**2) ** 2
         bent, terms = arc.curvature, 2 if straight else 3
         cosine, sine = np.cos(bent * along), _sine(along, bent)
-        values = np.stack([np.ones_like(along), sine, _versine(along, bent)][:terms])
-        slopes = np.stack([np.zeros_like(along), cosine, sine][:terms]) * lever
-        turns = _turns(arc.frame, cosine, bent * sine, directions) * lever
-        matrix = (values * weights) @ values.T + (slopes * weights) @ slopes.T
-        targets = (values * weights) @ offsets + (slopes * weights) @ turns
+        values = np.array([np.ones_like(along), sine, _versine(along, bent)][:terms])
+        weighted = values * weights
+        matrix, targets = weighted @ values.T, weighted @ offsets
+        if lever:
+            slopes = np.array([np.zeros_like(along), cosine, sine][:terms]) * lever
+            turns = _turns(arc.frame, cosine, bent * sine, directions) * lever
+            matrix, targets = matrix + (slopes * weights) @ slopes.T, targets + (slopes * weights) @ turns
         scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))  # columns of the same size: no unit matters
         matrix = matrix / scale[:, None] / scale + RIDGE * np.eye(terms)
         steps = np.linalg.solve(matrix, targets / scale[:, None]) / scale[:, None]

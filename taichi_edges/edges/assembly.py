@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from taichi_edges.edges.arc_growth import INLIER, Cloud
+from taichi_edges.edges.arc_growth import Cloud
 from taichi_edges.edges.arcs import Arc
 from taichi_edges.edges.branches import separate_branches
 from taichi_edges.edges.claiming import claims
@@ -15,7 +14,7 @@ from taichi_edges.edges.merging import merged
 from taichi_edges.edges.noise import measured_scale
 from taichi_edges.edges.segmentation import split_clusters
 
-BESIDE = 2.0  # times the tolerance: what lies so near to an edge and runs along it is no edge of its own
+HALO = 0.5  # of a point's neighbours: where so many lie on an edge, the point is a stray one of it
 ARC_NUMBERS = 12  # origin, tangent, bend; low, high, closed
 
 
@@ -59,26 +58,25 @@ def assemble(points, directions, config):
         labels[piece.own] = number
         shared.append(np.stack([piece.shared, np.full(len(piece.shared), number)], axis=1))
     arcs = np.array([pack_arc(piece.arc) for piece in pieces]).reshape(-1, ARC_NUMBERS)
-    left = left_over(cloud, ledger.owner, config)
+    left = left_over(cloud, graph, ledger.owner, config)
     labels = np.where(left >= 0, left + len(pieces), labels)
     free = np.full((left.max() + 1, ARC_NUMBERS), np.nan)
     return Assembly(labels, np.concatenate(shared), np.concatenate([arcs, free]))
 
 
-def left_over(cloud, owner, config):
-    """(n,) labels of the clusters that graph traversal finds in what no line or arc has claimed."""
-    labels = np.full(len(owner), UNASSIGNED)
-    left = np.flatnonzero(owner < 0)
-    taken = np.flatnonzero(owner >= 0)
-    if len(taken) and len(left):
-        distances, nearest = cKDTree(cloud.points[taken]).query(cloud.points[left])
-        along = np.abs((cloud.directions[taken[nearest]] * cloud.directions[left]).sum(axis=1)) >= cloud.scale.cosine
-        left = left[~(along & (distances <= BESIDE * INLIER * cloud.scale.noise))]
-    if len(left) < 2:
+def left_over(cloud, graph, owner, config):
+    """(n,) labels of the clusters that graph traversal finds in what no line or arc has claimed.
+
+    What has mostly claimed points around it is their halo, and no edge of its own. graph: NeighborGraph of the points.
+    """
+    labels, present = np.full(len(owner), UNASSIGNED), graph.indices >= 0
+    claimed = (present & (owner[graph.indices] >= 0)).sum(axis=1)
+    left = np.flatnonzero((owner < 0) & (claimed < HALO * present.sum(axis=1)))
+    if len(left) < config.min_points:
         return labels
-    found = grow_clusters(cloud.points[left], cloud.directions[left], config)
-    found = separate_branches(cloud.points[left], found, config.min_points)
-    labels[left] = split_clusters(cloud.points[left], found, config.min_points)
+    points, directions = cloud.points[left], cloud.directions[left]
+    found = separate_branches(points, grow_clusters(points, directions, config), config.min_points)
+    labels[left] = split_clusters(points, found, config.min_points)
     return labels
 
 

@@ -17,6 +17,7 @@ from taichi_edges.edges.arcs import Arc, fit_arc
 OUTLIER = INLIER**2  # squared noises: what a point on an edge brings at most
 LINE_PRICE, ARC_PRICE = 5, 8  # free parameters: a line and where it ends; an arc, which has a plane and a bend as well
 OWN_SHARE = 0.5  # of the points along a stretch, which must be an arc's own: elsewhere it repeats another
+LEAST_DENSITY = 4.0  # own points on the length of a gap, on average; strays line up by chance, but not so closely
 COVERED = 2.5  # noises: a point so near to what has grown from another seed needs no growth of its own
 ROUNDS, COARSER = 3, 2.0  # of claiming, and from the noise of one to that of the next
 MOST_NOISE = 2e-3  # unit-cube units; coarser rounds would claim neighbouring edges (the paper's lines take 5e-3)
@@ -147,6 +148,8 @@ def supported(cloud, arc, owner, min_points):
     kept = _own_stretches(along, own, cloud.scale.gap)
     own &= kept
     if own.sum() < min_points:
+        return 0.0, None
+    if own.sum() * cloud.scale.gap < LEAST_DENSITY * np.ptp(along[own]):
         return 0.0, None
     gain = (OUTLIER - squared[own]).sum() - price(arc) * np.log(len(members))
     whole = arc if arc.closed and own.mean() >= OWN_SHARE else arc.over(along[kept].min(), along[kept].max())
