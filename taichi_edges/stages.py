@@ -271,7 +271,8 @@ def fit(run):
 
     views = read_views(run.path("views.npz"))
     with np.load(run.path("clusters.npz")) as archive:
-        edges, counts = fit_assembly(archive["points"], archive["labels"], archive["shared"], archive["arcs"], run.config.fit)
+        parts = (archive[name] for name in ("points", "labels", "shared", "arcs"))
+        edges, counts = fit_assembly(*parts, run.config.fit)
     clusters = {kind: counts[kind] for kind in ("line", "curve", "loop", "short", "degenerate")}
     about = {"frame": "input", "clusters": clusters, "scene": run.config.name, "seed": run.config.seed}
     write_edges(run.path("edges.json"), edges.transformed(views.similarity.to_input), about)

@@ -88,7 +88,9 @@ def test_an_arc_fit_from_a_poor_start_ends_on_the_arc(radius, angle):
     points, tangents = (turned(part) - shift for part, shift in zip(circle(radius, -angle / 2, angle / 2), (0, 0.5)))
     middle, tangent = turned(np.array([[radius, 0, 0]]))[0], turned(np.array([[0.0, 1, 0]]))[0] - 0.5
     inward = 0.5 - turned(np.array([[1.0, 0, 0]]))[0]
-    start = Arc(middle + 0.01 * radius * inward, tangent, 0.6 * inward / radius, -radius * angle / 2, radius * angle / 2)
+    start = Arc(
+        middle + 0.01 * radius * inward, tangent, 0.6 * inward / radius, -radius * angle / 2, radius * angle / 2
+    )
     arc = fit_arc(start, points, tangents, 0.0, 1.0, straight=False, rounds=8)
     assert np.abs(arc.coordinates(points)[1]).max() < 1e-6
     assert arc.curvature == pytest.approx(1 / radius, rel=1e-3, abs=1e-5)
@@ -131,7 +133,11 @@ def test_an_arc_goes_on_where_it_is_moved_to_its_middle():
 @pytest.mark.parametrize("noise", NOISES)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_rim_that_lines_touch_is_one_closed_circle(noise, seed):
-    tangents = [line((0.2, 0, 0), (0.2, 0.3, 0)), line((-0.2, -0.3, 0), (-0.2, 0.3, 0)), line((0, 0.2, 0), (-0.3, 0.2, 0))]
+    tangents = [
+        line((0.2, 0, 0), (0.2, 0.3, 0)),
+        line((-0.2, -0.3, 0), (-0.2, 0.3, 0)),
+        line((0, 0.2, 0), (-0.3, 0.2, 0)),
+    ]
     rim = circle(0.2)
     found, edges = edges_of(*observed(rim, *tangents, noise=noise, seed=seed)[:2])
     arcs = [unpack_arc(numbers) for numbers in found.arcs]
@@ -150,9 +156,12 @@ def test_curves_that_touch_a_rim_in_their_middle_leave_it_whole(seed):
     angles = np.pi / 3 * np.arange(6)
     lobes = []
     for angle in angles:
+
         def lobe(t, angle=angle):
             depth = 0.2 * (1 / np.cos(t) - 1)
-            return np.stack([np.cos(t + angle) * (0.2 + depth), np.sin(t + angle) * (0.2 + depth), -1.5 * depth], axis=1)
+            return np.stack(
+                [np.cos(t + angle) * (0.2 + depth), np.sin(t + angle) * (0.2 + depth), -1.5 * depth], axis=1
+            )
 
         lobes.append(curve(lobe, -np.pi / 6, np.pi / 6))
     found, edges = edges_of(*observed(circle(0.2), *lobes, seed=seed)[:2])
@@ -248,7 +257,10 @@ def test_points_of_a_contact_are_shared():
     points, directions, _ = observed(*parts)
     found, edges = edges_of(points, directions)
     assert count_edges(edges) == 2 and len(edges.lines) == 1 and edges.lengths[0] == pytest.approx(0.6, abs=0.01)
-    assert len(found.shared) and (np.linalg.norm(points[found.shared[:, 0]] - turned(np.array([[0.2, 0, 0]])), axis=1) < 0.05).all()
+    assert (
+        len(found.shared)
+        and (np.linalg.norm(points[found.shared[:, 0]] - turned(np.array([[0.2, 0, 0]])), axis=1) < 0.05).all()
+    )
 
 
 def test_dropped_edges_leave_the_others_with_their_points():

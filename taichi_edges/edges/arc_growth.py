@@ -60,22 +60,25 @@ class Cloud:
         cloud.noises = noises
         return cloud
 
-    def near(self, arc, low, high):
+    def near(self, arc, low, high, tolerance=INLIER):
         """Indices of the points about the arc between two arc lengths; some farther ones are among them."""
         high = min(high, low + arc.round)
         count = int((high - low) / self.scale.gap) + 1
         step = (high - low) / count
-        radius = np.hypot(0.5 * step, INLIER * self.scale.noise) * (1 + 1e-9)
+        radius = np.hypot(0.5 * step, tolerance * self.scale.noise) * (1 + 1e-9)
         found = self.tree.query_ball_point(arc.at(low + step * (np.arange(count) + 0.5)), radius)
         return np.unique(np.fromiter(itertools.chain.from_iterable(found), np.int64))
 
-    def inliers(self, arc, low, high):
-        """Indices, arc lengths and squared residuals (noises) of the points on the arc between two arc lengths."""
-        around = self.near(arc, low, high)
+    def inliers(self, arc, low, high, tolerance=INLIER):
+        """Indices, arc lengths and squared residuals (noises) of the points on the arc between two arc lengths.
+
+        tolerance: noises that they may be off.
+        """
+        around = self.near(arc, low, high, tolerance)
         along, offsets = replace(arc, low=low, high=high).coordinates(self.points[around])
         squared = (offsets**2).sum(axis=1) / self.scale.noise**2
         agree = np.abs((self.directions[around] * arc.tangents(along)).sum(axis=1)) >= self.scale.cosine
-        good = (squared <= INLIER**2) & agree & (along >= low) & (along <= high)
+        good = (squared <= tolerance**2) & agree & (along >= low) & (along <= high)
         return around[good], along[good], squared[good]
 
 

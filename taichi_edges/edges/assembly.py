@@ -8,7 +8,14 @@ from taichi_edges.edges.arc_growth import Cloud
 from taichi_edges.edges.arcs import Arc
 from taichi_edges.edges.branches import separate_branches
 from taichi_edges.edges.claiming import claims
-from taichi_edges.edges.clustering import UNASSIGNED, alignment, grow_clusters, members_of_clusters, neighbor_graph, seed_order
+from taichi_edges.edges.clustering import (
+    UNASSIGNED,
+    alignment,
+    grow_clusters,
+    members_of_clusters,
+    neighbor_graph,
+    seed_order,
+)
 from taichi_edges.edges.fitting import NOISE_FLOOR, Fit, edges_of, fit_cluster, fit_line
 from taichi_edges.edges.merging import merged
 from taichi_edges.edges.noise import measured_scale
@@ -100,19 +107,19 @@ def fit_assembly(points, labels, shared, arcs, config):
     points: (n, 3) unit cube; the others as in Assembly. config: the scene's `fit` section.
     """
     own = members_of_clusters(labels)
-    also = members_of_clusters_of(shared, len(arcs))
+    also = sharers(shared, len(arcs))
     members = [np.concatenate(pair) for pair in zip(own, also, strict=True)]
     fits = (fit_edge(points[some], unpack_arc(arc), config) for some, arc in zip(members, arcs, strict=True))
     return edges_of(fits)
 
 
-def members_of_clusters_of(shared, count):
+def sharers(shared, count):
     """The points of each of `count` edges that they share with others: a list of index arrays."""
     return [shared[shared[:, 1] == number, 0] for number in range(count)]
 
 
 def fit_edge(points, arc, config):
-    """The Fit of one edge: its line or arc as it is, if the paper's ratio of errors keeps the arc; else `fit_cluster`."""
+    """The Fit of one edge: its line or arc as it is, if the paper's ratio of errors keeps the arc, or `fit_cluster`."""
     if arc is None:
         return fit_cluster(points, config)
     if arc.length < config.min_length:

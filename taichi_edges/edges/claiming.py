@@ -1,9 +1,9 @@
 """Whole lines and circular arcs that claim the oriented points, best supported first.
 
-Graph traversal follows an edge wherever it goes smoothly, and where edges touch tangentially also where it does not. Here
-a line and an arc grow from every seed over all points, whatever their clusters, as far as places and directions agree.
-The one with the greatest support claims its points, the next one what is left; so a rim that touches other edges is one
-closed circle, and the points that remain are the other edges. Points at a contact are claimed by one and shared by both.
+Graph traversal follows an edge wherever it goes smoothly, at a tangential touch into the other edge as well. Here a line
+and an arc grow from seeds over all points, as far as places and directions agree. The one with the greatest support
+claims its points, the next one what is left; so a rim that touches other edges is one closed circle, and the points
+that remain are the other edges. Points at a contact are claimed by one and shared by both.
 """
 
 import heapq
@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from taichi_edges.edges.arc_growth import INLIER, Cloud, bent_from, grown_from_neighbors, unbroken
+from taichi_edges.edges.arc_growth import INLIER, bent_from, grown_from_neighbors, unbroken
 from taichi_edges.edges.arcs import Arc, fit_arc
 
 OUTLIER = INLIER**2  # squared noises: what a point on an edge brings at most
 LINE_PRICE, ARC_PRICE = 5, 8  # free parameters: a line and where it ends; an arc, which has a plane and a bend as well
 OWN_SHARE = 0.5  # of the points along a stretch, which must be an arc's own: elsewhere it repeats another
 LEAST_DENSITY = 4.0  # own points on the length of a gap, on average; strays line up by chance, but not so closely
-COVERED = 2.5  # noises: a point so near to what has grown from another seed needs no growth of its own
+COVERED = 1.5  # times the tolerance: a point so near to what has grown needs no growth of its own in this round
 ROUNDS, COARSER = 3, 2.0  # of claiming, and from the noise of one to that of the next
 MOST_NOISE = 2e-3  # unit-cube units; coarser rounds would claim neighbouring edges (the paper's lines take 5e-3)
 TAIL = 0.7  # of the gap: an edge goes on past its sharp points in steps of that size at most
@@ -130,8 +130,7 @@ def candidates(cloud, neighbors, seeds, min_points, owner):
         gains = [supported(cloud, arc, owner, min_points)[0] for arc in grown]
         for arc, gain in zip(grown, gains, strict=True):
             if gain == max(gains):  # even where it is too short to be claimed: its points will not do better
-                members, _, squared = cloud.inliers(arc, arc.low, arc.high)
-                covered[members[squared <= COVERED**2]] = True
+                covered[cloud.inliers(arc, arc.low, arc.high, COVERED * INLIER)[0]] = True
             if gain > 0:
                 yield arc
 

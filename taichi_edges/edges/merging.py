@@ -1,8 +1,8 @@
 """Pieces that continue each other become one edge: a line, an arc, or a free curve where neither describes them.
 
 Whether they do is decided as everywhere here: squared residuals in units of the points' noise plus the price of the
-free parameters, ln n each (BIC). Two pieces of one line pay one price instead of two; an ellipse or a hyperbola that was
-claimed by several arcs is one cubic; a fillet between two lines stays three edges, because no cubic follows all three.
+free parameters, ln n each (BIC). Two pieces of one line pay one price instead of two; a hyperbola that was claimed by
+several arcs is one cubic; a fillet between two lines stays three edges, because no cubic follows all three.
 """
 
 import heapq
@@ -112,7 +112,7 @@ def capped(squared, noises):
 
 
 def joints(cloud, pieces, some):
-    """Pairs of ends, each (number of the piece, 0 or 1), that are near and look at each other; one of them in `some`."""
+    """Pairs of ends that are near and look at each other, each (number of the piece, 0 or 1); one of them in `some`."""
     numbers = [number for number, piece in pieces.items() if not piece.closed]
     if len(numbers) < 2:
         return []

@@ -9,7 +9,7 @@ import numpy as np
 
 from taichi_edges.edges.arc_growth import Cloud, Scale, bent_from, grown_from_neighbors
 
-PROBES = 32  # seeds from which lines and arcs are grown
+PROBES = 24  # seeds from which lines and arcs are grown
 LONGEST = 0.5  # share of these that tell the noise; the others may be bits of freer curves, which are off by more
 LEAST_NOISE = 2e-4  # unit-cube units, about a tenth of a pixel: near corners the best detector is off by as much
 MOST_NOISE = 1e-2  # unit-cube units; what is off by more is no edge
@@ -49,6 +49,8 @@ def _residuals(cloud, neighbors, probe):
     for grown in (line, arc):
         if grown is not None:
             members, along, squared = cloud.inliers(grown, grown.low, grown.high)
+            if not len(members):
+                continue
             cosines = np.abs((cloud.directions[members] * grown.tangents(along)).sum(axis=1))
             noise = np.sqrt(np.median(squared)) * cloud.scale.noise / RAYLEIGH
             yield grown.length, noise, np.median(np.arccos(np.minimum(cosines, 1.0))) / RAYLEIGH
