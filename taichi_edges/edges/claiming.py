@@ -1,6 +1,6 @@
 """Whole lines and circular arcs that claim the oriented points, best supported first.
 
-Graph traversal follows an edge wherever it goes smoothly, at a tangential touch into the other edge as well. Here a line
+Graph traversal follows an edge wherever it goes smoothly, at a tangential touch into the other edge too. Here a line
 and an arc grow from seeds over all points, as far as places and directions agree. The one with the greatest support
 claims its points, the next one what is left; so a rim that touches other edges is one closed circle, and the points
 that remain are the other edges. Points at a contact are claimed by one and shared by both.
