@@ -9,12 +9,12 @@ import numpy as np
 
 from taichi_edges.edges.arc_growth import Cloud, Scale, bent_from, grown_from_neighbors
 
-PROBES = 24  # seeds from which lines and arcs are grown
+PROBES = 40  # seeds from which lines and arcs are grown
 LONGEST = 0.5  # share of these that tell the noise; the others may be bits of freer curves, which are off by more
 LEAST_NOISE = 2e-4  # unit-cube units, about a tenth of a pixel: near corners the best detector is off by as much
 MOST_NOISE = 1e-2  # unit-cube units; what is off by more is no edge
 STEP = np.sqrt(2.0)  # from one tolerance to the next
-CUT_OFF = 0.35  # measured noise over the one assumed; nearer to 1 the tolerance may be what is measured
+CUT_OFF = 0.33  # measured noise over the one assumed; nearer to 1 the tolerance may be what is measured
 RAYLEIGH = 1.1774  # median distance over the standard deviation on each axis, of a normal distribution in the plane
 LEAST_TURN, FIRST_TURN = np.radians([0.5, 5.0])  # of directions: at least, and until they have been measured
 
