@@ -233,10 +233,8 @@ def _write_csv(path, rows):
 
 def cluster(run):
     """`gaussians.ply`, `views.npz` -> `points.ply` (filtered oriented points, input frame) and `clusters.npz`."""
-    from taichi_edges.edges.branches import separate_branches
-    from taichi_edges.edges.clustering import grow_clusters
+    from taichi_edges.edges.assembly import assemble
     from taichi_edges.edges.filtering import drop_contours, filter_points
-    from taichi_edges.edges.segmentation import split_clusters
     from taichi_edges.exporters.point_cloud import write_oriented_points
     from taichi_edges.exporters.splats import read_gaussians
     from taichi_edges.kernels.device import is_running, start_taichi
@@ -255,13 +253,13 @@ def cluster(run):
         problem = f"none of {len(means)} Gaussians passed the filters ({_in_words(asdict(counts))})"
         cure = "train longer, or lower filter.min_opacity or filter.min_support"
         raise UserError(f"{run.path('gaussians.ply')}: {problem}; {cure}")
-    labels = grow_clusters(points, directions, run.config.cluster)
-    labels = separate_branches(points, labels, run.config.cluster.min_points)
-    labels = split_clusters(points, labels, run.config.cluster.min_points)
-    labels, contours = drop_contours(labels, steadiness, run.config.filter.min_steadiness)
+    found = assemble(points, directions, run.config.cluster)
+    labels, contours = drop_contours(found.labels, steadiness, run.config.filter.min_steadiness)
+    found = found.keep(np.isin(np.arange(len(found.arcs)), found.labels[labels >= 0]))
+    labels = found.labels
     write_oriented_points(run.path("points.ply"), views.similarity.to_input(points), directions, labels)
     with replacing(run.path("clusters.npz")) as unfinished, open(unfinished, "wb") as file:
-        np.savez_compressed(file, points=points, directions=directions, labels=labels)
+        np.savez_compressed(file, points=points, directions=directions, **asdict(found))
     found = {"points": len(points), "clusters": int(labels.max() + 1), "unclustered": int((labels < 0).sum())}
     return {**asdict(counts), **found, "contours": contours}
 
@@ -273,11 +271,12 @@ def _in_words(counts):
 
 def fit(run):
     """`clusters.npz` -> `edges.json` (input frame)."""
-    from taichi_edges.edges.fitting import fit_clusters
+    from taichi_edges.edges.assembly import fit_assembly
 
     views = read_views(run.path("views.npz"))
     with np.load(run.path("clusters.npz")) as archive:
-        edges, counts = fit_clusters(archive["points"], archive["labels"], run.config.fit)
+        parts = (archive[name] for name in ("points", "labels", "shared", "arcs"))
+        edges, counts = fit_assembly(*parts, run.config.fit)
     clusters = {kind: counts[kind] for kind in ("line", "curve", "loop", "short", "degenerate")}
     about = {"frame": "input", "clusters": clusters, "scene": run.config.name, "seed": run.config.seed}
     write_edges(run.path("edges.json"), edges.transformed(views.similarity.to_input), about)

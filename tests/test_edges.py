@@ -587,8 +587,9 @@ def filtered(points, opacities=None, **config):
     """filter_points with directions that carry the points' numbers."""
     opacities = np.ones(len(points)) if opacities is None else opacities
     directions = np.stack([np.arange(len(points)), np.zeros(len(points)), np.zeros(len(points))], axis=1)
-    settings = FilterConfig(**{"outlier_neighbors": 0, **config})
-    found, kept, _, counts = filter_points(points, directions, opacities, four_views(), settings, 0.5, None)
+    settings = FilterConfig(**{"outlier_neighbors": 0, "refine": False, **config})
+    random = np.random.default_rng(0)
+    found, kept, _, counts = filter_points(points, directions, opacities, four_views(), settings, 0.5, random)
     np.testing.assert_array_equal(found, np.asarray(points)[kept[:, 0].astype(int)])
     assert counts.gaussians == len(points)
     assert counts.gaussians - counts.low_opacity - counts.low_support - counts.outliers == len(found)
@@ -614,8 +615,8 @@ def test_support_counts_only_the_views_that_see_a_point(taichi):
     away[3] = np.diag([-1.0, 1, -1, 1])[:3]  # the last camera looks the other way
     views = Views(views.names, views.edge_maps, views.intrinsics, away, views.image_paths)
     points = points_on_column(3)
-    settings = FilterConfig(min_support=1.0, outlier_neighbors=0)
-    assert len(filter_points(points, points, np.ones(3), views, settings, 0.5, None)[0]) == 3
+    settings = FilterConfig(min_support=1.0, outlier_neighbors=0, refine=False)
+    assert len(filter_points(points, points, np.ones(3), views, settings, 0.5, np.random.default_rng(0))[0]) == 3
 
 
 def test_support_is_a_share_of_the_views(taichi):
@@ -625,8 +626,9 @@ def test_support_is_a_share_of_the_views(taichi):
     views = Views(views.names, maps, views.intrinsics, views.world_to_camera, views.image_paths)
     points = points_on_column(3)
     for share, expected in ((0.25, 3), (0.26, 0)):
-        settings = FilterConfig(min_support=share, outlier_neighbors=0)
-        assert len(filter_points(points, points, np.ones(3), views, settings, 0.5, None)[0]) == expected
+        settings = FilterConfig(min_support=share, outlier_neighbors=0, refine=False)
+        found = filter_points(points, points, np.ones(3), views, settings, 0.5, np.random.default_rng(0))[0]
+        assert len(found) == expected
 
 
 def test_isolated_points_are_outliers(generator):

@@ -38,10 +38,14 @@ def fit_clusters(points, labels, config):
     points: (n, 3) unit cube. labels: (n,) cluster of each point, -1 for none. config: the scene's `fit` section.
     Returns the EdgeSet (sources are the labels) and the dict kind -> number of clusters.
     """
+    return edges_of(fit_cluster(points[members], config) for members in members_of_clusters(labels))
+
+
+def edges_of(fits):
+    """The EdgeSet of some Fits, whose sources are their numbers, and the dict kind -> how many there are."""
     lines, curves, line_sources, curve_sources = [], [], [], []
     counts = dict.fromkeys(("line", "curve", "loop", "short", "degenerate"), 0)
-    for label, members in enumerate(members_of_clusters(labels)):
-        fit = fit_cluster(points[members], config)
+    for label, fit in enumerate(fits):
         counts[fit.kind] += 1
         if fit.kind == "line":
             lines.append(fit.line)
@@ -117,14 +121,14 @@ def fit_curve(points, ordering, tolerance):
     turning = 2 * np.pi if ordering.closed else total_turning(points, ordering.arc)
     most = max(len(points) // POINTS_PER_PIECE, 1)
     pieces = min(max(int(np.ceil(turning / TURN_PER_CUBIC)), 4 if ordering.closed else 1), most)
-    curves, error = _fit_chain(points, ordering, tolerance, pieces)
+    curves, error = fit_chain(points, ordering, tolerance, pieces)
     tried = [pieces + 1, *(leap * pieces for leap in LEAPS)]
     while tried:
         count = tried.pop(0)
         more_than_one = count > pieces + 1
         if count > most or (more_than_one and error <= tolerance):
             continue
-        more, smaller_error = _fit_chain(points, ordering, tolerance, count)
+        more, smaller_error = fit_chain(points, ordering, tolerance, count)
         doublings = np.log2(count / pieces) if more_than_one else 1.0
         if max(smaller_error, NOISE_FLOOR) <= WORTH_A_PIECE**doublings * error:
             curves, error, pieces = more, smaller_error, count
@@ -132,7 +136,7 @@ def fit_curve(points, ordering, tolerance):
     return curves, error
 
 
-def _fit_chain(points, ordering, tolerance, pieces):
+def fit_chain(points, ordering, tolerance, pieces):
     """`fit_curve` with a given number of pieces."""
     arc, length, closed = ordering.arc, ordering.length, ordering.closed
     weights = np.ones(len(points))

@@ -1,0 +1,188 @@
+"""Pieces that continue each other become one edge: a line, an arc, or a free curve where neither describes them.
+
+Whether they do is decided as everywhere here: squared residuals in units of the points' noise plus the price of the
+free parameters, ln n each (BIC). Two pieces of one line pay one price instead of two; a hyperbola that was claimed by
+several arcs is one cubic; a fillet between two lines stays three edges, because no cubic follows all three.
+"""
+
+import heapq
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from taichi_edges.edges.arc_growth import INLIER, SAGITTA, sagitta
+from taichi_edges.edges.arcs import Arc, fit_arc
+from taichi_edges.edges.claiming import OUTLIER, price
+from taichi_edges.edges.fitting import fit_chain, nearest_on_chain
+from taichi_edges.edges.ordering import Ordering
+
+CUBIC_PRICE, NEXT_CUBIC_PRICE = 12, 6  # free parameters of a cubic, and of one more in a smooth chain
+MOST_CUBICS = 4  # of an open curve
+WIDE = 4.0  # times the tolerance: the first fit to two pieces starts from one of them, and looks farther
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A part of an edge, or all of it.
+
+    arc: Arc, or None for a free curve. curves: (c, 4, 3) control points of a free curve, in order; None for an arc.
+    own, shared: indices of its points. along: arc lengths or chain parameters of own and then shared. cost: BIC.
+    """
+
+    arc: Arc | None
+    curves: np.ndarray | None
+    own: np.ndarray
+    shared: np.ndarray
+    along: np.ndarray
+    cost: float
+
+    @property
+    def members(self):
+        """All of its points."""
+        return np.concatenate([self.own, self.shared])
+
+    @property
+    def closed(self):
+        """Has it no ends?"""
+        return self.arc is not None and self.arc.closed
+
+    @property
+    def cubics(self):
+        """How many cubics describe it."""
+        if self.arc is None:
+            return len(self.curves)
+        return max(int(np.ceil(self.arc.length * self.arc.curvature / (0.5 * np.pi))), 1)
+
+    def ends(self):
+        """(2, 3) its two ends, and (2, 3) the tangents there, both pointing outwards."""
+        if self.arc is not None:
+            at = np.array([self.arc.low, self.arc.high])
+            return self.arc.at(at), self.arc.tangents(at) * np.array([[-1.0], [1.0]])
+        places = np.stack([self.curves[0, 0], self.curves[-1, 3]])
+        tangents = np.stack([self.curves[0, 0] - self.curves[0, 1], self.curves[-1, 3] - self.curves[-1, 2]])
+        return places, tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-300)
+
+    def lengths(self):
+        """Arc lengths of its points, at least in order of size; and (2,) those of its ends."""
+        if self.arc is not None:
+            return self.along, np.array([self.arc.low, self.arc.high])
+        scale = np.linalg.norm(np.diff(self.curves, axis=1), axis=2).sum() / len(self.curves)
+        return self.along * scale, np.array([0.0, len(self.curves)]) * scale
+
+
+def merged(cloud, claims, noises):
+    """Pieces of whole edges from Claims, see `claiming`.
+
+    cloud: Cloud. noises: (n,) at which each point was claimed, unit-cube units.
+    """
+    cloud = cloud.with_noises(noises)
+    pieces = {number: piece_of(cloud, claim.arc, claim.own, claim.shared) for number, claim in enumerate(claims)}
+    waiting, turns, count = [], itertools.count(), len(pieces)
+
+    def propose(some):
+        for a, b in joints(cloud, pieces, some):
+            gain, piece = joined(cloud, pieces[a[0]], pieces[b[0]], a[1], b[1])
+            if gain > 0:
+                heapq.heappush(waiting, (-gain, a[0], b[0], next(turns), piece))
+
+    propose(set(pieces))
+    while waiting:
+        _, a, b, _, piece = heapq.heappop(waiting)
+        if a in pieces and b in pieces:
+            del pieces[a], pieces[b]
+            pieces[count] = piece
+            count += 1
+            propose({count - 1})
+    return [pieces[number] for number in sorted(pieces)]
+
+
+def piece_of(cloud, arc, own, shared):
+    """The Piece of an arc and its points."""
+    members = np.concatenate([own, shared])
+    along, offsets = arc.coordinates(cloud.points[members])
+    cost = capped((offsets**2).sum(axis=1), cloud.noises[members]) + price(arc) * np.log(len(members))
+    return Piece(arc, None, own, shared, along, cost)
+
+
+def capped(squared, noises):
+    """Sum of (n,) squared distances in units of the noises, (n,), each at most OUTLIER."""
+    return float(np.minimum(squared / noises**2, OUTLIER).sum())
+
+
+def joints(cloud, pieces, some):
+    """Pairs of ends that are near and look at each other, each (number of the piece, 0 or 1); one of them in `some`."""
+    numbers = [number for number, piece in pieces.items() if not piece.closed]
+    if len(numbers) < 2:
+        return []
+    places, tangents = (np.concatenate(part) for part in zip(*(pieces[n].ends() for n in numbers), strict=True))
+    found = []
+    for i, j in sorted(cKDTree(places).query_pairs(cloud.scale.gap)):
+        a, b = numbers[i // 2], numbers[j // 2]
+        if a != b and (a in some or b in some) and tangents[i] @ tangents[j] <= -cloud.scale.cosine:
+            found.append(((a, i % 2), (b, j % 2)))
+    return found
+
+
+def joined(cloud, a, b, end_a, end_b):
+    """What it gains to make two pieces one, and that Piece; 0 and None where it does not pay."""
+    own = np.union1d(a.own, b.own)
+    shared = np.setdiff1d(np.union1d(a.shared, b.shared), own)
+    found = [free_piece(cloud, a, b, end_a, end_b, own, shared)]
+    if a.arc is not None and b.arc is not None:
+        longer = a.arc if a.arc.length >= b.arc.length else b.arc
+        found += [arc_piece(cloud, longer, own, shared, straight) for straight in (True, False)]
+    best = min((piece for piece in found if piece is not None), key=lambda piece: piece.cost, default=None)
+    gain = a.cost + b.cost - best.cost if best is not None else 0.0
+    return (gain, best) if gain > 0 else (0.0, None)
+
+
+def arc_piece(cloud, start, own, shared, straight):
+    """The points of two pieces as one line or arc; None where it bends too little for an arc."""
+    members, scale = np.concatenate([own, shared]), cloud.scale
+    points, directions, noises = cloud.points[members], cloud.directions[members], cloud.noises[members]
+    shares = (noises.min() / noises) ** 2
+    for tolerance in (WIDE * INLIER, INLIER):
+        start = fit_arc(start, points, directions, 0.0, tolerance * noises.max(), straight, shares=shares)
+    along, offsets = start.coordinates(points)
+    good = (offsets**2).sum(axis=1) <= OUTLIER * noises**2
+    if good.sum() < 2:
+        return None
+    arc = start.over(along[good].min(), along[good].max())
+    if arc.length + scale.gap >= arc.round:
+        arc = arc.over(arc.low, arc.low + arc.round)
+    if not straight and sagitta(arc) < SAGITTA * noises.min():
+        return None
+    return piece_of(cloud, arc.recentred(), own, shared)
+
+
+def free_piece(cloud, a, b, end_a, end_b, own, shared):
+    """The points of two pieces as a smooth chain of as few cubics as pay; see `joined`."""
+    members = np.concatenate([own, shared])
+    points, noises = cloud.points[members], cloud.noises[members]
+    ordering = chained(cloud, a, b, end_a, end_b, members)
+    best, most = None, min(a.cubics + b.cubics, MOST_CUBICS)
+    for cubics in range(1, most + 1):
+        if len(points) < 6 * cubics:
+            break
+        curves, _ = fit_chain(points, ordering, INLIER * noises.max(), cubics)
+        distances, along = nearest_on_chain(points, curves)
+        cost = (CUBIC_PRICE + NEXT_CUBIC_PRICE * (cubics - 1)) * np.log(len(points)) + capped(distances**2, noises)
+        if best is None or cost < best.cost:
+            best = Piece(None, curves, own, shared, along, cost)
+    return best
+
+
+def chained(cloud, a, b, end_a, end_b, members):
+    """Ordering of the members of two pieces: along the one to its end `end_a`, on from `end_b` along the other."""
+    (along_a, ends_a), (along_b, ends_b) = a.lengths(), b.lengths()
+    before = (along_a - ends_a[end_a]) * (1 if end_a else -1)
+    after = (along_b - ends_b[end_b]) * (-1 if end_b else 1)
+    (places_a, outwards), (places_b, _) = a.ends(), b.ends()
+    after = after + (places_b[end_b] - places_a[end_a]) @ outwards[end_a]
+    arc = np.zeros(len(cloud.points))
+    arc[b.members] = after
+    arc[a.members] = before
+    arc = arc[members] - arc[members].min()
+    return Ordering(arc, float(arc.max()), False)
