@@ -218,7 +218,7 @@ def test_tracing_does_not_depend_on_the_threads_and_a_view_without_picture_has_n
     paths = write_pictures(tmp_path, generator)
     paths.insert(2, "")
     done = []
-    (one, sizes), (three, _) = trace_pictures(paths, threads=1), trace_pictures(paths, threads=3, report=done.append)
+    (one, _), (three, _) = trace_pictures(paths, threads=1), trace_pictures(paths, threads=3, report=done.append)
     for name in ("starts", "points", "normals", "strengths"):
         np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
     assert one.view_count == 6 and len(one.of_view(2)[0]) == 0 and np.diff(one.starts)[[0, 1, 3, 4, 5]].min() > 50

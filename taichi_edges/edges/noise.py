@@ -9,7 +9,7 @@ import numpy as np
 
 from taichi_edges.edges.arc_growth import Cloud, Scale, bent_from, grown_from_neighbors
 
-PROBES = 40  # seeds from which lines and arcs are grown
+PROBES = 20  # seeds from which lines and arcs are grown
 LONGEST = 0.5  # share of these that tell the noise; the others may be bits of freer curves, which are off by more
 LEAST_NOISE = 2e-4  # unit-cube units, about a tenth of a pixel: near corners the best detector is off by as much
 MOST_NOISE = 1e-2  # unit-cube units; what is off by more is no edge
