@@ -5,7 +5,7 @@ is the edge: its direction is what all planes have in common, its place their ro
 image loss converges to, but the loss sees grey levels of drawn lines, and these planes the sub-pixel points themselves.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -21,24 +21,26 @@ class RefinedPoints:
 
     points, directions: (n, 3) unit cube, unit vectors. views: (n,) number of views in which an edgel lies on the point,
     each counted by how closely, and by the edgel's strength. support: (n,) `views` as a share of those that have the
-    point in the image.
+    point in the image. spread: (n,) how much the viewing planes lean against each other, the second eigenvalue over the
+    first: the squared sine of their angles, roughly.
     """
 
     points: np.ndarray
     directions: np.ndarray
     views: np.ndarray
     support: np.ndarray
+    spread: np.ndarray
 
     def __len__(self):
         return len(self.points)
 
     def keep(self, chosen):
         """Only the chosen ones. chosen: (n,) bool or indices."""
-        return RefinedPoints(self.points[chosen], self.directions[chosen], self.views[chosen], self.support[chosen])
+        return RefinedPoints(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
     def joined(self, other):
         """These points and then the others."""
-        pairs = ((getattr(self, name), getattr(other, name)) for name in ("points", "directions", "views", "support"))
+        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
         return RefinedPoints(*(np.concatenate(pair) for pair in pairs))
 
 
@@ -54,17 +56,24 @@ def refine_points(matching, points, directions, radii=RADII_PX):
         steps, directions = _solve(equations.astype(np.float64), directions)
         lengths = np.linalg.norm(steps, axis=1, keepdims=True)
         points += steps * np.minimum(1.0, radius * matching.pixel / np.maximum(lengths, 1e-300))
-    equations = matching.equations(points, directions, radii[-1], SCALE_PX)
-    weight, seen = equations[:, 9].astype(np.float64), np.maximum(equations[:, 10], 1.0)
-    return RefinedPoints(points, directions, weight, weight / seen)
+    equations = matching.equations(points, directions, radii[-1], SCALE_PX).astype(np.float64)
+    weight, seen = equations[:, 9], np.maximum(equations[:, 10], 1.0)
+    values, _ = _principal_axes(equations)
+    spread = np.maximum(values[:, 1], 0.0) / np.maximum(values[:, 2], 1e-12)
+    return RefinedPoints(points, directions, weight, weight / seen, spread)
+
+
+def _principal_axes(equations):
+    """Eigenvalues (n, 3), ascending, and axes (n, 3, 3) of the viewing planes' normals."""
+    rows, columns = np.triu_indices(3)
+    matrices = np.empty((len(equations), 3, 3))
+    matrices[:, rows, columns] = matrices[:, columns, rows] = equations[:, :6]
+    return np.linalg.eigh(matrices)
 
 
 def _solve(equations, directions):
     """Steps (n, 3) across the common direction of the planes, and that direction where there is one."""
-    rows, columns = np.triu_indices(3)
-    matrices = np.empty((len(equations), 3, 3))
-    matrices[:, rows, columns] = matrices[:, columns, rows] = equations[:, :6]
-    values, axes = np.linalg.eigh(matrices)
+    values, axes = _principal_axes(equations)
     sides = axes[:, :, 1:]  # (n, 3, 2)
     pulls = np.einsum("nck,nc->nk", sides, equations[:, 6:9])
     firm = values[:, 1:] > LEAST_SPREAD * np.maximum(values[:, 2:], 1e-12)

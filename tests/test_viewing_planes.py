@@ -287,3 +287,16 @@ def test_clusters_that_are_not_steady_are_dropped():
     np.testing.assert_array_equal(kept, [0, 0, -1, -1, 1, -1])
     assert dropped == 1
     assert drop_contours(np.array([-1, -1]), np.ones(2), 0.72)[1] == 0
+
+
+def test_what_few_views_see_must_be_seen_from_different_directions(taichi, generator):
+    config = FilterConfig(refine=True, min_support=0.0)
+    points, along = displaced(A, 50, 0.0, generator)
+    for cameras, trusted in ((ring_cameras(5, SIZE), True), (narrow_cameras(5), False)):
+        matching = EdgelMatching(views_of([A], generator, noise_px=0.02, cameras=cameras, count=5))
+        refined = refine_points(matching, points, along)
+        assert refined.views.min() > 3
+        supported, _, _ = judge(matching, refined, config)
+        assert supported.mean() > 0.9 if trusted else supported.mean() < 0.1
+    many = EdgelMatching(views_of([A], generator, noise_px=0.02, cameras=narrow_cameras(16), count=16))
+    assert judge(many, refine_points(many, points, along), config)[0].mean() > 0.9

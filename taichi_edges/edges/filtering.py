@@ -13,7 +13,10 @@ from scipy.spatial import cKDTree
 from taichi_edges.support import exclusive_support
 
 AROUND = 9  # points, itself included, over which the steadiness of a point is a median
-LEAST_VIEWS = 2.5  # of full strength; two planes always meet, and a third one is there by chance too easily
+LEAST_VIEWS = 3.0  # of full strength; two planes always meet, and a third one is there by chance too easily
+# An edge that fewer views see must be seen from different directions, 15 degrees apart from their mean: neighbouring
+# views see an occluding contour in one place as well.
+FEW_VIEWS, FEW_SPREAD = 6.0, np.sin(np.radians(15.0)) ** 2
 LENIENT = 0.75  # of the least steadiness, for a point
 RARE = 0.8  # of a harvested point's support, which those that continue it need
 HARVEST_KEEP = 0.06  # share of the views that must see one of the edges left over
@@ -106,7 +109,8 @@ def judge(matching, refined, config):
     from taichi_edges.explaining import explain
 
     explained = explain(matching, refined)
-    supported = (explained.support >= config.min_support) & (refined.views >= LEAST_VIEWS)
+    apart = (refined.views >= FEW_VIEWS) | (refined.spread >= FEW_SPREAD)
+    supported = (explained.support >= config.min_support) & (refined.views >= LEAST_VIEWS) & apart
     steady, places = supported.copy(), refined.points[supported]
     if len(places):
         around = cKDTree(places).query(places, min(AROUND, len(places)))[1].reshape(len(places), -1)
