@@ -72,6 +72,7 @@ def print_summary(run, record, until=None):
         _print_table(f"{run.config.name}: metrics", ("metric", "value"), found)
     _print_table(f"{run.config.name}: stages", ("stage", "time", "peak memory"), rows)
     written = ["edges.json", *record["stages"]["export"]["facts"]["files"]] if "export" in done else []
+    written += [name for name in record["stages"]["prepare"]["facts"]["files"] if name == "detection.png"]
     files = ", ".join(name for name in written if "/" not in name)
     print(f"results: {run.folder}/" + (f"  ({files})" if files else ""))
 

@@ -13,26 +13,27 @@ def left_out(*amounts):
 
 
 def describe_prepare(facts):
-    """'12 views, 128 x 128 px, lines 2.4 px wide; maps shifted by (-0.55, -0.71) px: corrected'."""
+    """'12 views, 128 x 128 px, 9000 edgels, lines 2.4 px wide; maps shifted by (-0.55, -0.71) px: corrected'."""
     part = f" of the synthetic part '{facts['part']}'" if "part" in facts else ""
     size = f"{facts['width_px']} x {facts['height_px']} px"
     lines = f"lines {facts['line_width_px']:.1f} px wide" if "line_width_px" in facts else "edges from the images"
-    return f"{amount(facts['views'], 'view')}{part}, {size}, {lines}{describe_calibration(facts.get('calibration'))}"
+    found = f"{amount(facts['views'], 'view')}{part}, {size}, {amount(facts['edgels'], 'edgel')}, {lines}"
+    return f"{found}{describe_calibration(facts.get('calibration'))}"
 
 
 def describe_calibration(facts):
     """'; maps shifted by (-0.55, -0.71) px: corrected; silhouettes 1.32 px outside: corrected', '' without facts."""
     if facts is None:
         return ""
-    if facts.get("reason") and "none" in (facts["shift_method"], facts["silhouette_method"]):
-        return f"; no calibration: {facts['reason']}"
     found = []
-    if facts["shift_px"] is not None and None not in facts["shift_px"]:
+    if facts["shift_method"] != "none":
         right, down = facts["shift_px"]
         found.append((f"maps shifted by ({right:+.2f}, {down:+.2f}) px", facts["shift_applied"]))
-    if facts["silhouette_px"] is not None:
+    if facts["silhouette_method"] != "none":
         found.append((f"silhouettes {facts['silhouette_px']:+.2f} px outside", facts["silhouette_applied"]))
-    return "".join(f"; {what}: {'corrected' if applied else 'left as it is'}" for what, applied in found)
+    reason = facts.get("reason") or "the views show too little"
+    unknown = f"; not calibrated in full: {reason}" if len(found) < 2 else ""
+    return "".join(f"; {what}: {'corrected' if applied else 'left as it is'}" for what, applied in found) + unknown
 
 
 def describe_train(facts):
@@ -42,14 +43,20 @@ def describe_train(facts):
 
 
 def describe_cluster(facts):
-    """'823 points in 40 clusters; left out: 40 Gaussians of low support, 12 points in clusters that are too small'."""
-    clustered = facts["points"] - facts["unclustered"]
-    return f"{amount(clustered, 'point')} in {amount(facts['clusters'], 'cluster')}" + left_out(
-        (facts["low_opacity"], "Gaussian of low opacity", "Gaussians of low opacity"),
-        (facts["low_support"], "Gaussian of low support", "Gaussians of low support"),
-        (facts["contours"], "occluding contour"),
-        (facts["outliers"], "outlier"),
-        (facts["unclustered"], "point in a cluster that is too small", "points in clusters that are too small"),
+    """'823 points on 40 edges (500 grown, 20 harvested); left out: 40 Gaussians of low opacity, ..., 2 contours'."""
+    found = f"{amount(facts['points'] - facts['unclustered'], 'point')} on {amount(facts['clusters'], 'edge')}"
+    more = [f"{facts[kind]} {kind}" for kind in ("grown", "harvested") if facts[kind]]
+    return (
+        found
+        + (f" ({', '.join(more)})" if more else "")
+        + left_out(
+            (facts["low_opacity"], "Gaussian of low opacity", "Gaussians of low opacity"),
+            (facts["low_support"], "point of low support", "points of low support"),
+            (facts["unsteady"], "point on a contour", "points on contours"),
+            (facts["contours"], "whole contour"),
+            (facts["outliers"], "outlier"),
+            (facts["unclustered"], "point on no edge", "points on no edge"),
+        )
     )
 
 

@@ -43,7 +43,7 @@ class SourceConfig(Section):
     detector: Literal["auto", "maps", "subpixel", "onnx"] = Field(
         "auto", description="ready maps, our own detector, or a network; auto: maps if `edges` is given, else subpixel"
     )
-    gamma: NotNegative = Field(
+    gamma: Annotated[float, Field(ge=0, le=10)] = Field(
         0.0, description="how images encode light, for `subpixel`: value = light^(1/gamma); 0: sRGB, as PNG and JPEG do"
     )
     onnx: OnnxConfig = Field(default_factory=lambda: OnnxConfig())
@@ -84,10 +84,12 @@ def _is_shift(value):
 class CalibrationConfig(Section):
     """Biases of ready or learned edge maps, see detectors/calibration.py. `calibration: off` switches both off."""
 
-    shift: Annotated[str | list[float], _measured_or(_is_shift, "[right, down] in pixels")] = Field(
+    shift: Annotated[
+        str | list[float], _measured_or(_is_shift, f"[right, down] in pixels, less than {MOST_BIAS:g} each")
+    ] = Field(
         "auto", description="by which the maps are shifted against the images: measured, [right, down] px, or off"
     )
-    silhouette: Annotated[str | float, _measured_or(_is_length, "a number of pixels")] = Field(
+    silhouette: Annotated[str | float, _measured_or(_is_length, f"a number of pixels below {MOST_BIAS:g}")] = Field(
         "auto", description="by which silhouettes lie outside the true ones: measured, px, or off"
     )
 

@@ -21,6 +21,7 @@ from taichi_edges.edge_set import read_edges, write_edges
 from taichi_edges.errors import UserError, did_you_mean
 from taichi_edges.views import read_views, write_views
 
+WIDEST_PX = 40.0  # of a detector's lines
 CALIBRATION_SEEDS = 4000  # 3D points through which a detector's biases are measured, at most
 
 
@@ -44,7 +45,11 @@ def prepare(run):
 def _finish_views(run, views):
     """Trace and calibrate the edgels where the detector gave maps, write `views.npz` and the report; the facts."""
     facts = {"views": len(views), "width_px": views.width, "height_px": views.height}
-    residuals = {}
+    residuals, wanted = {}, run.config.calibration
+    if views.edgels is not None and not (isinstance(wanted.shift, str) and isinstance(wanted.silhouette, str)):
+        raise UserError(
+            "calibration: our own detector has no bias to correct; leave it out, or name ready maps in source.edges"
+        )
     if views.edgels is None:
         views, width = _traced(run, views)
         facts["line_width_px"] = round(width, 2)
@@ -80,6 +85,9 @@ def _traced(run, views):
     from taichi_edges.support import line_width
 
     width, _ = line_width(views, run.config.train.edge_threshold)
+    if width > WIDEST_PX:
+        problem = f"the lines of the edge maps are {width:.0f} px wide; are these photographs?"
+        raise UserError(f"{problem} Then name their folder as source.images, and set source.detector: subpixel")
     return replace(
         views, edgels=trace_ridges(views.edge_maps, width, run.config.source.thin_threshold, run.threads)
     ), width
@@ -97,7 +105,13 @@ def _calibrated(run, views):
     edgels = views.edgels
     if (wanted.shift, wanted.silhouette) != ("off", "off") and len(edgels):
         edgels, calibration = _calibrate(run, views, redrawn(edgels))
-    return redrawn(edgels) if run.config.source.thin else replace(views, edgels=edgels), calibration
+    if run.config.source.thin:
+        return redrawn(edgels), calibration
+    if calibration is not None and (calibration.shift_applied or calibration.silhouette_applied):
+        run.progress.warn(
+            "source.thin is false: the training learns from the maps as they are, only the edgels are corrected"
+        )
+    return replace(views, edgels=edgels), calibration
 
 
 def _calibrate(run, views, thin):
@@ -234,7 +248,7 @@ def _write_csv(path, rows):
 def cluster(run):
     """`gaussians.ply`, `views.npz` -> `points.ply` (filtered oriented points, input frame) and `clusters.npz`."""
     from taichi_edges.edges.assembly import assemble
-    from taichi_edges.edges.filtering import drop_contours, filter_points
+    from taichi_edges.edges.filtering import FEW_VIEWS, LEAST_VIEWS, drop_contours, filter_points
     from taichi_edges.exporters.point_cloud import write_oriented_points
     from taichi_edges.exporters.splats import read_gaussians
     from taichi_edges.kernels.device import is_running, start_taichi
@@ -252,6 +266,9 @@ def cluster(run):
     if len(points) == 0:
         problem = f"none of {len(means)} Gaussians passed the filters ({_in_words(asdict(counts))})"
         cure = "train longer, or lower filter.min_opacity or filter.min_support"
+        if run.config.filter.refine and len(views) < FEW_VIEWS:
+            seen = f"an edge must be seen in {LEAST_VIEWS:g} views at full strength"
+            cure = f"{len(views)} views are too few, {seen}: take more, or set filter.refine: false"
         raise UserError(f"{run.path('gaussians.ply')}: {problem}; {cure}")
     found = assemble(points, directions, run.config.cluster)
     labels, contours = drop_contours(found.labels, steadiness, run.config.filter.min_steadiness)
@@ -350,14 +367,22 @@ def source_files(run):
     """Every file the prepare stage reads, so that a changed input is noticed."""
     source = run.config.source
     points = [run.data_path(source.points, "source.points")] if source.points else []
+    models = [_model_file(run)] if source.detector == "onnx" else []
     if source.reader == "synthetic":
-        return points
+        return [*points, *models]
     from taichi_edges.readers import READERS
 
     frames = READERS[source.reader](run.data_path(source.path, "source.path"), source)
     paths = [Path(path) for path in (*frames.edge_paths, *frames.image_paths) if path]
-    models = [run.data_path(source.onnx.model, "source.onnx.model")] if source.detector == "onnx" else []
     return [frames.where, *sorted({path for path in paths if path.is_file()}), *points, *models]
+
+
+def _model_file(run):
+    """The ONNX file the scene names."""
+    path = run.data_path(run.config.source.onnx.model, "source.onnx.model")
+    if not path.is_file():
+        raise UserError(f"source.onnx.model: {path} is a folder; name the ONNX file")
+    return path
 
 
 def truth_files(run):

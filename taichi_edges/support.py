@@ -8,7 +8,7 @@ import weakref
 import cv2
 import numpy as np
 
-from taichi_edges.cameras import NEAR
+from taichi_edges.views import pixel_size
 
 OWNER_ROUNDS = 4  # owners whose own support turns out weak lose their pixels in the next round
 CLAIM = 0.8  # a point claims the pixels within this many line widths of its projection
@@ -56,14 +56,6 @@ def _measure_width(edge_maps, threshold):
         distances += float(cv2.distanceTransform(edges, cv2.DIST_L2, 5).sum())
         pixels += int(edges.sum())
     return max(4.0 * distances / max(pixels, 1) - 2.0, 1.0)
-
-
-def pixel_size(views):
-    """Size of a pixel at the middle of the scene box, unit-cube units: median over the views."""
-    forward, offset = views.world_to_camera[:, 2, :3], views.world_to_camera[:, 2, 3]
-    depths = forward @ views.box.mean(axis=0) + offset
-    in_front = np.maximum(depths, NEAR)  # a view that looks away says nothing about the scale
-    return float(np.median(in_front / views.intrinsics[:, 0, 0]))
 
 
 def exclusive_support(views, points, threshold):

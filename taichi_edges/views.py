@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from taichi_edges.artefacts import file_state, replacing
-from taichi_edges.cameras import Similarity, project
+from taichi_edges.cameras import NEAR, Similarity, project
 from taichi_edges.edgels import Edgels
 
 EDGEL_ARRAYS = ("starts", "points", "normals", "strengths")  # the fields of Edgels, in order
@@ -61,6 +61,14 @@ class Views:
     def project(self, points, view):
         """Pixels (n, 2), NaN behind the camera, and depths (n,) of (n, 3) unit-cube points in one view."""
         return project(points, self.intrinsics[view], self.world_to_camera[view])
+
+
+def pixel_size(views):
+    """Size of a pixel at the middle of the scene box, unit-cube units: median over the views."""
+    forward, offset = views.world_to_camera[:, 2, :3], views.world_to_camera[:, 2, 3]
+    depths = forward @ views.box.mean(axis=0) + offset
+    in_front = np.maximum(depths, NEAR)  # a view that looks away says nothing about the scale
+    return float(np.median(in_front / views.intrinsics[:, 0, 0]))
 
 
 def write_views(path, views):

@@ -31,8 +31,8 @@ from taichi_edges.edges.filtering import filter_points, statistical_inliers
 from taichi_edges.edges.fitting import (
     BENDING,
     _lsq_chain,
+    edges_of,
     fit_cluster,
-    fit_clusters,
     fit_curve,
     fit_line,
     nearest_on_chain,
@@ -394,14 +394,15 @@ def test_every_cluster_is_counted_once():
     points, labels = np.concatenate(shapes), np.repeat(np.arange(5), [len(shape) for shape in shapes])
     unassigned = np.random.default_rng(0).random((30, 3))
     points, labels = np.concatenate([points, unassigned]), np.concatenate([labels, np.full(30, UNASSIGNED)])
-    edges, counts = fit_clusters(points, labels, FitConfig(min_length=0.01))
+    config = FitConfig(min_length=0.01)
+    edges, counts = edges_of(fit_cluster(points[members], config) for members in members_of_clusters(labels))
     assert counts == {"line": 1, "curve": 1, "loop": 1, "short": 1, "degenerate": 1}
     assert edges.line_sources.tolist() == [0] and set(edges.curve_sources.tolist()) == {1, 2}
     assert len(edges.line_sources) == len(edges.lines) and len(edges.curve_sources) == len(edges.curves)
 
 
 def test_no_clusters_give_no_edges():
-    edges, counts = fit_clusters(np.zeros((3, 3)), np.full(3, UNASSIGNED), FitConfig())
+    edges, counts = edges_of([])
     assert len(edges) == 0 and sum(counts.values()) == 0
 
 

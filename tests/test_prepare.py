@@ -116,7 +116,7 @@ def test_without_images_or_maps_there_is_one_line(prepare, folder):
     message = refusal(prepare)
     assert "set source.edges" in message and "edge_test" in message
     assert "set source.images" in refusal(prepare, {"detector": "subpixel"})
-    assert "no colour image found here; check source.images" in refusal(prepare, {"images": "colours"})
+    assert "colours: no such folder; check source.images" in refusal(prepare, {"images": "colours"})
 
 
 def test_images_of_two_sizes_are_refused(prepare, folder):
@@ -200,3 +200,46 @@ def test_a_synthetic_scene_can_be_traced_in_its_own_pictures(tmp_path):
     facts = stages.prepare(run)
     assert facts["part"] == "block" and "line_width_px" not in facts and facts["edgels"] > 200
     assert (tmp_path / "truth.json").is_file()
+
+
+def test_lines_that_leave_the_image_when_they_are_moved_are_no_trouble(prepare, folder):
+    for path in (folder / "edge_test").iterdir():
+        edge_map = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        edge_map[:, 79:81] = 255
+        edge_map[79:81] = 255
+        cv2.imwrite(str(path), edge_map)
+    for shift in ([-9.0, -9.0], [9.0, 9.0], [0.0, -0.9]):
+        facts, views, _ = prepare({"edges": "edge_test"}, calibration={"shift": shift, "silhouette": "off"})
+        assert facts["edgels"] == len(views.edgels) and (views.edge_maps >= 128).any()
+
+
+def test_a_calibration_where_there_is_none_is_refused(prepare):
+    assert "our own detector has no bias" in refusal(prepare, calibration={"shift": [3, 3]})
+    _, _, warnings = prepare({"edges": "edge_test", "thin": False}, calibration={"shift": [3, 3]})
+    assert any("source.thin is false" in text for text in warnings)
+
+
+def test_photographs_are_not_taken_for_edge_maps(prepare, folder):
+    for path in (folder / "edge_test").iterdir():
+        cv2.imwrite(str(path), np.where(np.arange(SIZE) < SIZE // 3, 255, 60)[None].repeat(SIZE, 0).astype(np.uint8))
+    assert "px wide; are these photographs?" in refusal(prepare, {"edges": "edge_test"})
+
+
+def test_a_nerf_folder_of_photographs_needs_no_key_to_say_so(prepare, folder, tmp_path):
+    content = json.loads((folder / "meta_data.json").read_text())
+    flip = np.diag([1.0, -1, -1, 1])
+    frames = [
+        {
+            "file_path": f"./{kind}/{Path(frame['rgb_path']).stem}",
+            "transform_matrix": (np.array(frame["camtoworld"]) @ flip).tolist(),
+            "camera_intrinsics": frame["intrinsics"],
+        }
+        for kind in ("color",)
+        for frame in content["frames"]
+    ]
+    (folder / "transforms_train.json").write_text(json.dumps({"frames": frames}))
+    assert prepare({"reader": "nerf"})[0]["detector"] == "subpixel"
+    for frame in frames:
+        frame["file_path"] = frame["file_path"].replace("color", "edge_test")
+    (folder / "transforms_train.json").write_text(json.dumps({"frames": frames}))
+    assert prepare({"reader": "nerf"})[0]["detector"] == "maps"

@@ -17,6 +17,7 @@ from taichi_edges.detectors.offsets import LEAST_OBSERVATIONS, Estimate, fit_off
 from taichi_edges.support import line_width
 
 SURE, WORTH_PX = 3.0, 0.1  # a bias is corrected from so many standard errors and so many pixels on
+UNKNOWN_PX = 2.0  # a standard error beyond says that the bias has not been measured
 EDGE_LEVEL = 0.5  # of full scale, at which the width of the maps' lines is measured
 
 
@@ -155,6 +156,8 @@ def _choose(part, known, estimates):
     if not estimates:
         return _Choice(np.zeros_like(known[part]), np.full_like(known[part], np.nan), "none", False)
     best = min(estimates, key=lambda estimate: np.linalg.norm(estimate.errors[part]))
+    if np.linalg.norm(best.errors[part]) > UNKNOWN_PX:  # nothing has been observed of it, a prior alone keeps it finite
+        return _Choice(np.zeros_like(known[part]), np.full_like(known[part], np.nan), "none", False)
     values, errors = best.values[part], best.errors[part]
     applied = np.linalg.norm(values) > max(SURE * np.linalg.norm(errors), WORTH_PX)
     return _Choice(values, errors, best.method, bool(applied))

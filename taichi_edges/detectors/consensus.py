@@ -14,7 +14,7 @@ from taichi_edges.detectors.offsets import (
     fit_offsets,
     standard_errors,
 )
-from taichi_edges.support import pixel_size
+from taichi_edges.views import pixel_size
 
 LEAST_POINTS, MOST_POINTS = 50, 3000  # fewer are no use; more only cost time: each is seen by most of the views
 REACHES = (5.0, 3.0)  # px around a 3D point within which an edgel may be its, round by round

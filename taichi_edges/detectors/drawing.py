@@ -25,19 +25,26 @@ def draw_edge_maps(edgels, height, width, threads=None):
 
 
 def draw_lines(points, normals, values, height, width, sigma=DRAWN_SIGMA):
-    """(H, W) uint8 map of lines through the points: a Gaussian profile of `sigma` pixels across each, `value` high."""
-    image = np.zeros((height + 2 * PATCH, width + 2 * PATCH), np.float32)
+    """(H, W) uint8 map of lines through the points: a Gaussian profile of `sigma` pixels across each, `value` high.
+
+    A calibration may have moved points out of the image; those farther out than the patch is wide draw nothing.
+    """
+    pixels = np.rint(points)
+    near = ((pixels >= -PATCH) & (pixels < np.array([width, height]) + PATCH)).all(axis=1)
+    points, normals, values = points[near], normals[near], values[near]
+    margin = 2 * PATCH  # a patch around the farthest point
+    image = np.zeros((height + 2 * margin, width + 2 * margin), np.float32)
     for start in range(0, len(points), DRAWN_AT_ONCE):
         part = slice(start, start + DRAWN_AT_ONCE)
         _draw_patches(image, points[part], normals[part], values[part], sigma)
     image *= 255
-    return np.rint(image, out=image)[PATCH:-PATCH, PATCH:-PATCH].astype(np.uint8)
+    return np.rint(image, out=image)[margin:-margin, margin:-margin].astype(np.uint8)
 
 
 def _draw_patches(image, points, normals, values, sigma):
-    """Draw some of the points into `image`, which is PATCH pixels larger on every side."""
+    """Draw some of the points into `image`, which is 2 PATCH pixels larger on every side."""
     centres = np.rint(points)
-    patch = np.arange(2 * PATCH + 1)  # pixels of `image`, and offsets from the point: (n, 1, 7) right, (n, 7, 1) down
+    patch = np.arange(2 * PATCH + 1)  # offsets from the point, and pixels: (n, 1, 7) right, (n, 7, 1) down
     right = (centres - points)[:, 0, None, None] + (patch - PATCH)
     down = (centres - points)[:, 1, None, None] + (patch - PATCH)[:, None]
     across_squared = (right * normals[:, 0, None, None] + down * normals[:, 1, None, None]) ** 2
@@ -46,5 +53,5 @@ def _draw_patches(image, points, normals, values, sigma):
     profiles = np.exp(-0.5 * (across_squared + np.maximum(along_squared - 1.0, 0.0)) / sigma**2)
     heights = (values[:, None, None] * profiles).astype(np.float32)
     columns, rows = centres.astype(np.int64).T[:, :, None, None]
-    places = (rows + patch[:, None]) * image.shape[1] + columns + patch
+    places = (rows + PATCH + patch[:, None]) * image.shape[1] + columns + PATCH + patch
     np.maximum.at(image.reshape(-1), places.ravel(), heights.ravel())  # fast in one dimension and one type only

@@ -7,7 +7,6 @@ from scipy.spatial import cKDTree
 
 from taichi_edges.bezier import bernstein, evaluate_bezier
 from taichi_edges.edge_set import EdgeSet
-from taichi_edges.edges.clustering import members_of_clusters
 from taichi_edges.edges.ordering import order_points
 
 ROBUST_ROUNDS = 10
@@ -30,15 +29,6 @@ class Fit:
     kind: str
     line: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 3)))
     curves: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 3)))
-
-
-def fit_clusters(points, labels, config):
-    """Fit every cluster.
-
-    points: (n, 3) unit cube. labels: (n,) cluster of each point, -1 for none. config: the scene's `fit` section.
-    Returns the EdgeSet (sources are the labels) and the dict kind -> number of clusters.
-    """
-    return edges_of(fit_cluster(points[members], config) for members in members_of_clusters(labels))
 
 
 def edges_of(fits):

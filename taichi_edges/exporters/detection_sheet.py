@@ -309,7 +309,7 @@ def _axis(picture, limit):
 # --- The text around the cells ---
 
 HEADINGS = {
-    _whole_picture: ("view", "as the detector sees it"),
+    _whole_picture: ("view", ""),
     _whole_map: ("edge map", "what the splatting learns from"),
     _whole_edgels: ("edgels", "framed: the part that is magnified"),
     _magnified_edgels: ("edgels, magnified", None),

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from taichi_edges.cameras import NEAR
 from taichi_edges.kernels.device import download, upload
 from taichi_edges.kernels.points import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D, blocks_of, load_camera, load_point
-from taichi_edges.support import pixel_size
+from taichi_edges.views import pixel_size
 
 CELL = 8  # px; side of the cells in which edgels are looked up, at least the largest radius
 MOST_SINE = 0.35  # of the angle between an edgel and a projected direction: 20 degrees, as a bend or noise may turn it

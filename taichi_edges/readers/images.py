@@ -18,8 +18,10 @@ def frames_with_images(frames, progress):
         raise UserError(f"{frames.where}: no colour images to detect edges in; set source.images ({folders})")
     usable = [is_usable(path) for path in frames.image_paths]
     if not any(usable):
-        path = Path(frames.image_paths[0])
-        raise UserError(f"{path.parent}: no colour image found here; check source.images")
+        folder = Path(frames.image_paths[0]).parent
+        problem = "no colour image that can be read" if folder.is_dir() else "no such folder"
+        folders = f"{frames.where.parent} has: {folders_beside(frames)}"
+        raise UserError(f"{folder}: {problem}; check source.images ({folders})")
     lost = [name for name, ok in zip(frames.names, usable, strict=True) if not ok]
     if lost:
         progress.warn(

@@ -21,17 +21,34 @@ def read_nerf(folder, config):
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{where}: has no 'frames'; is this a transforms file of NEF or NeRF (Blender)?")
     paths = [_file_path(frame, where) for frame in frames]
+    # NEF's frames name edge maps, which are grey, those of other NeRF scenes photographs.
+    own_images = not config.edges and not config.images and _is_colour(folder / paths[0])
     return Frames(
         where=where,
         names=[path.stem for path in paths],
-        edge_paths=[folder / (config.edges or path.parent) / path.name for path in paths],
-        image_paths=[folder / config.images / path.name if config.images else "" for path in paths],
+        edge_paths=["" if own_images else folder / (config.edges or path.parent) / path.name for path in paths],
+        image_paths=[folder / path if own_images else _image(folder, config, path) for path in paths],
         intrinsics=[
             partial(_intrinsics, frame, content, path.stem, where) for frame, path in zip(frames, paths, strict=True)
         ],
         camera_to_world=[frame.get("transform_matrix") for frame in frames],
         opengl=True,
     )
+
+
+def _image(folder, config, path):
+    """Path of the colour image that belongs to a frame's file; '' where the scene names no folder of them."""
+    return folder / config.images / path.name if config.images else ""
+
+
+def _is_colour(path):
+    """Whether there is an image at `path` with transparency, or with channels that differ."""
+    import cv2
+
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+    if image is None or image.ndim == 2:
+        return False
+    return image.shape[2] == 4 or bool((image != image[:, :, :1]).any())
 
 
 def _file_path(frame, where):

@@ -22,7 +22,8 @@ from taichi_edges.kernels.points import (
     load_point,
     nearest_pixel,
 )
-from taichi_edges.support import exclusive_support, pixel_size
+from taichi_edges.support import exclusive_support
+from taichi_edges.views import pixel_size
 
 STEPS_PER_PIXEL, FARTHEST = 4, 255  # distances are kept in quarter pixels, one byte each
 HALF_DIAGONAL = np.sqrt(3) / 2  # of a unit cell
