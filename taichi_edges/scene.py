@@ -179,7 +179,9 @@ class FilterConfig(Section):
     """Which trained Gaussians become oriented points."""
 
     min_opacity: Share = Field(0.2)
-    min_support: Share = Field(0.05, description="share of the views that see a point and have an edge pixel there")
+    min_support: Share = Field(
+        0.05, description="share of the views that see a point and have an edge pixel (refine: edgel) of its own there"
+    )
     refine: bool = Field(False, description="move points to where the viewing planes of their edgels meet")
     min_steadiness: Share = Field(
         0.72, description="refine: share of the unexplained edgels near an edge that lie on it, relative to sure edges"
@@ -191,7 +193,7 @@ class FilterConfig(Section):
 
 
 class ClusterConfig(Section):
-    """Graph traversal (paper 3.3)."""
+    """How points become edges: lines and arcs that claim them, and graph traversal (paper 3.3)."""
 
     theta: Share = Field(0.8, description="|cos| from which on orientations agree; 0.6 for curved objects")
     neighbors: Count = Field(10, description="spatial neighbours of a point")
@@ -200,7 +202,7 @@ class ClusterConfig(Section):
 
 
 class FitConfig(Section):
-    """Lines and cubic Bezier curves (paper 3.3)."""
+    """Lines and cubic Bezier curves (paper 3.3) for what no line or arc claims."""
 
     delta: NotNegative = Field(0.5, description="a curve is kept when its error <= delta * the line's; 1 for DTU")
     line_tolerance: Positive = Field(0.005, description="inlier distance of the robust line, unit-cube units")
