@@ -33,7 +33,7 @@ from benchmarks.markdown import table
 
 ROOT = Path(__file__).resolve().parent.parent
 AXES = {"gaussians": "Gaussians", "views": "views", "pixels": "width of a square view, pixels"}
-ARRAYS = ("maps", "words")  # of EdgeImages
+ARRAYS = ("maps", "edge_words")  # of EdgeImages
 SEED = 0
 
 
