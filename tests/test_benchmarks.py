@@ -107,7 +107,7 @@ def test_scaling_prints_points_and_draws(run, tmp_path):
     )
     assert exponents[0]["ms of all threads"].endswith("at the end)") and exponents[1]["ms of all threads"] == "-"
     maps, words = 4 * 96 * 96, 4 * 96 * 3 * 4
-    wanted = {"maps of the reader": maps, "words": words, "all of these": maps + words}
+    wanted = {"maps of the reader": maps, "edge_words": words, "all of these": maps + words}
     assert {row["array"]: int(row["bytes"]) for row in arrays} == wanted
     assert "Maps and masks fit in 1 GiB" in text and len(moments) == 5
     assert cv2.imread(str(picture)).std() > 5
