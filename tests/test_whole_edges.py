@@ -284,3 +284,35 @@ def test_the_scale_covers_the_noise_and_is_not_much_wider(noise):
     neighbors = [row[good] for row, good in zip(graph.indices, (graph.indices >= 0) & (aligned >= 0.8))]
     scale = measured_scale(points, directions, neighbors, seed_order(points, directions, graph, aligned), 0.03)
     assert max(noise, LEAST_NOISE) <= scale.noise <= max(6 * noise, LEAST_NOISE)
+
+
+def ellipse(t):
+    return np.stack([0.5 + 0.3 * np.cos(2 * np.pi * t), 0.5 + 0.1 * np.sin(2 * np.pi * t), 0 * t + 0.5], axis=1)
+
+
+def saddle(t):
+    turn = 2 * np.pi * t
+    return np.stack([0.5 + 0.2 * np.cos(turn), 0.5 + 0.2 * np.sin(turn), 0.5 + 0.04 * np.cos(2 * turn)], axis=1)
+
+
+def wave(t):
+    return np.stack([0.1 + 0.8 * t, 0.5 + 0.1 * np.sin(2 * np.pi * t), 0 * t + 0.5], axis=1)
+
+
+def helix(t):
+    return np.stack([0.5 + 0.2 * np.cos(6 * np.pi * t), 0.5 + 0.2 * np.sin(6 * np.pi * t), 0.2 + 0.6 * t], axis=1)
+
+
+@pytest.mark.parametrize(("curve", "closed"), [(ellipse, True), (saddle, True), (wave, False), (helix, False)])
+def test_a_free_curve_is_one_edge_and_closes_if_it_is_closed(generator, curve, closed):
+    fine = np.linspace(0, 1, 20001)
+    arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(curve(fine), axis=0), axis=1))])
+    t = np.interp(np.linspace(0, arc[-1], int(arc[-1] / 0.0025), endpoint=not closed), arc, fine)
+    along = curve(t + 1e-4) - curve(t - 1e-4)
+    along = along / np.linalg.norm(along, axis=1, keepdims=True) + generator.normal(0, 0.02, (len(t), 3))
+    points = curve(t) + generator.normal(0, 2e-4, (len(t), 3))
+    found = assemble(points, along / np.linalg.norm(along, axis=1, keepdims=True), ClusterConfig())
+    edges, counts = fit_assembly(points, found.labels, found.shared, found.arcs, FitConfig())
+    assert len(found.arcs) == 1 and counts["loop" if closed else "curve"] == 1
+    off = cKDTree(edges.sample(5e-4)[0]).query(curve(fine))[0]
+    assert off.max() < 3e-3

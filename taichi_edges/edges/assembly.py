@@ -17,6 +17,7 @@ from taichi_edges.edges.clustering import (
     seed_order,
 )
 from taichi_edges.edges.fitting import NOISE_FLOOR, Fit, edges_of, fit_cluster, fit_line
+from taichi_edges.edges.free_curves import free_curves
 from taichi_edges.edges.merging import merged
 from taichi_edges.edges.noise import measured_scale
 from taichi_edges.edges.segmentation import split_clusters
@@ -59,7 +60,13 @@ def assemble(points, directions, config):
     neighbors = [row[good] for row, good in zip(graph.indices, follows, strict=True)]
     cloud = Cloud(points, directions, measured_scale(points, directions, neighbors, seeds, config.max_gap))
     found, ledger = claims(cloud, neighbors, seeds, config.min_points)
-    pieces = merged(cloud, found, ledger.noise)
+    pieces, free = merged(cloud, found, ledger.noise), []
+    replaced = set()
+    for members, own in free_curves(cloud, pieces, config):
+        if not own & replaced:
+            replaced |= own
+            free.append(members)
+    pieces = [piece for number, piece in enumerate(pieces) if number not in replaced]
     labels, shared = np.full(len(points), UNASSIGNED), [np.zeros((0, 2), int)]
     for number, piece in enumerate(pieces):
         labels[piece.own] = number
@@ -67,8 +74,17 @@ def assemble(points, directions, config):
     arcs = np.array([pack_arc(piece.arc) for piece in pieces]).reshape(-1, ARC_NUMBERS)
     left = left_over(cloud, graph, ledger.owner, config)
     labels = np.where(left >= 0, left + len(pieces), labels)
-    free = np.full((left.max() + 1, ARC_NUMBERS), np.nan)
-    return Assembly(labels, np.concatenate(shared), np.concatenate([arcs, free]))
+    for number, members in enumerate(free, start=len(pieces) + left.max() + 1):
+        labels[members] = number
+    unknown = np.full((left.max() + 1 + len(free), ARC_NUMBERS), np.nan)
+    return without_empty(Assembly(labels, np.concatenate(shared), np.concatenate([arcs, unknown])))
+
+
+def without_empty(assembly):
+    """The Assembly without edges that have lost all of their points to a free curve."""
+    used = np.zeros(len(assembly.arcs), bool)
+    used[assembly.labels[assembly.labels >= 0]] = True
+    return assembly.keep(used)
 
 
 def left_over(cloud, graph, owner, config):

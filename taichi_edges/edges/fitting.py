@@ -14,6 +14,7 @@ REPARAMETRIZATIONS = 4
 TURN_PER_CUBIC = np.radians(100.0)  # one cubic follows a circular arc of 90 degrees to 3e-4 of the radius
 POINTS_PER_PIECE = 6  # at least
 WORTH_A_PIECE = 0.8  # another piece must bring the error down to this share, and again for every doubling of pieces
+FAR_OFF = 3.0  # noise floors
 LEAPS = (2, 3)  # times as many pieces, tried where one more does not pay and the chain is far off
 NOISE_FLOOR = 3.5e-4  # unit-cube units; a mean distance below is no reason for a curve or for another piece
 LINE_PARAMETERS = 4  # of a line in space
@@ -103,20 +104,19 @@ def fit_curve(points, ordering, tolerance):
     """Chain of cubic Beziers through (n, 3) points by robust least squares over the arc-length parameter.
 
     The chain is a cubic spline with a continuous tangent, cut into its Bezier pieces; as many pieces as the points'
-    total turning asks for, and more while that pays. Where one more does not, but the points are off by more than
-    `tolerance`, twice and three times as many may, as on a rim of scallops. (Continuous curvature as well would need
-    twice the pieces to follow a circle.)
+    total turning asks for, and more while that pays. Where one more does not, but the points are far off, twice and
+    three times as many may, as on a rim of scallops or round the sharp ends of an ellipse. (Continuous curvature as
+    well would need twice the pieces to follow a circle.)
     Returns control points (m, 4, 3) and the corrected mean distance of all points to the chain.
     """
-    turning = 2 * np.pi if ordering.closed else total_turning(points, ordering.arc)
     most = max(len(points) // POINTS_PER_PIECE, 1)
-    pieces = min(max(int(np.ceil(turning / TURN_PER_CUBIC)), 4 if ordering.closed else 1), most)
+    pieces = min(fewest_cubics(points, ordering), most)
     curves, error = fit_chain(points, ordering, tolerance, pieces)
     tried = [pieces + 1, *(leap * pieces for leap in LEAPS)]
     while tried:
         count = tried.pop(0)
         more_than_one = count > pieces + 1
-        if count > most or (more_than_one and error <= tolerance):
+        if count > most or (more_than_one and error <= FAR_OFF * NOISE_FLOOR):
             continue
         more, smaller_error = fit_chain(points, ordering, tolerance, count)
         doublings = np.log2(count / pieces) if more_than_one else 1.0
@@ -136,6 +136,12 @@ def fit_chain(points, ordering, tolerance, pieces):
         arc = _reparametrize(arc, parameters, length, closed)
         weights = 1.0 / (1.0 + (distances / tolerance) ** 2) ** 2
     return curves, corrected_error(distances, 4 * (pieces + 1))  # two across each end of each piece, value and slope
+
+
+def fewest_cubics(points, ordering):
+    """As many cubics as the total turning of (n, 3) ordered points asks for."""
+    turning = 2 * np.pi if ordering.closed else total_turning(points, ordering.arc)
+    return max(int(np.ceil(turning / TURN_PER_CUBIC)), 4 if ordering.closed else 1)
 
 
 def total_turning(points, arc):
@@ -179,7 +185,9 @@ def _lsq_chain(parameters, points, weights, pieces):
     rows = np.sqrt(weights)[:, None]
     bend = np.diff(np.eye(design.shape[1]), 2, axis=0) * BENDING * np.sqrt(weights.sum())
     targets = np.concatenate([points * rows, np.zeros((len(bend), 3))])
-    polygon = np.linalg.lstsq(np.concatenate([design * rows, bend]), targets, rcond=None)[0]
+    # Normal equations: a B-spline's are well conditioned, and small whatever the number of points.
+    system = np.concatenate([design * rows, bend])
+    polygon = np.linalg.solve(system.T @ system, system.T @ targets)
     return local @ polygon[unknowns]
 
 
