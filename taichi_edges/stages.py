@@ -37,19 +37,24 @@ def prepare(run):
     frames = chosen_frames(READERS[source.reader](run.data_path(source.path, "source.path"), source), source.skip)
     camera_poses(frames)  # a mistake in them shall not wait for the detector
     detector = choose_detector(source, frames)
+    _refuse_needless_calibration(run, detector)
     frames, edge_maps, edgels = DETECTORS[detector](frames, run)
     views = build_views(frames, edge_maps, edgels, source, run.config.box, run.progress)
     return {"detector": detector, **_finish_views(run, views)}
 
 
+def _refuse_needless_calibration(run, detector):
+    """UserError where the scene gives biases of maps, and there are no maps."""
+    wanted = run.config.calibration
+    if detector == "subpixel" and not (isinstance(wanted.shift, str) and isinstance(wanted.silhouette, str)):
+        problem = "calibration: our own detector has no bias to correct"
+        raise UserError(f"{problem}; leave it out, or name ready maps in source.edges")
+
+
 def _finish_views(run, views):
     """Trace and calibrate the edgels where the detector gave maps, write `views.npz` and the report; the facts."""
     facts = {"views": len(views), "width_px": views.width, "height_px": views.height}
-    residuals, wanted = {}, run.config.calibration
-    if views.edgels is not None and not (isinstance(wanted.shift, str) and isinstance(wanted.silhouette, str)):
-        raise UserError(
-            "calibration: our own detector has no bias to correct; leave it out, or name ready maps in source.edges"
-        )
+    residuals = {}
     if views.edgels is None:
         views, width = _traced(run, views)
         facts["line_width_px"] = round(width, 2)
@@ -167,6 +172,7 @@ def _prepare_synthetic(run):
     if source.part not in PARTS:
         hint = did_you_mean(source.part, PARTS) or f"; there is {', '.join(PARTS)}"
         raise UserError(f"source.part: there is no part '{source.part}'{hint}")
+    _refuse_needless_calibration(run, source.detector)
     part = PARTS[source.part]()
     generator = np.random.default_rng(run.config.seed)
     views, pictures = render_views(part, source.views, source.size, Imperfections(), generator)

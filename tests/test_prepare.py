@@ -243,3 +243,16 @@ def test_a_nerf_folder_of_photographs_needs_no_key_to_say_so(prepare, folder, tm
         frame["file_path"] = frame["file_path"].replace("color", "edge_test")
     (folder / "transforms_train.json").write_text(json.dumps({"frames": frames}))
     assert prepare({"reader": "nerf"})[0]["detector"] == "maps"
+
+
+def test_a_needless_calibration_is_refused_before_edges_are_looked_for(prepare, monkeypatch):
+    monkeypatch.setattr("taichi_edges.detectors.subpixel.trace_pictures", lambda *_: pytest.fail("too late"))
+    assert "our own detector has no bias" in refusal(prepare, calibration={"silhouette": 1.3})
+
+
+def test_images_of_16_bits_calibrate_as_those_of_8_do(prepare, folder):
+    known = {"edges": "edge_test"}
+    shallow = prepare(known)[0]["calibration"]
+    for path in (folder / "color").iterdir():
+        cv2.imwrite(str(path), cv2.imread(str(path)).astype(np.uint16) * 257)
+    assert prepare(known)[0]["calibration"] == shallow

@@ -5,9 +5,12 @@ import pytest
 from scipy.spatial import cKDTree
 
 from taichi_edges.bezier import bezier_lengths, evaluate_bezier
+from taichi_edges.edges.arc_growth import Cloud, Scale
 from taichi_edges.edges.arcs import Arc, fit_arc
 from taichi_edges.edges.assembly import assemble, fit_assembly, pack_arc, unpack_arc
 from taichi_edges.edges.clustering import UNASSIGNED, alignment, neighbor_graph, seed_order
+from taichi_edges.edges.free_curves import free_curves
+from taichi_edges.edges.merging import Piece
 from taichi_edges.edges.noise import LEAST_NOISE, measured_scale
 from taichi_edges.scene import ClusterConfig, FitConfig
 
@@ -316,3 +319,18 @@ def test_a_free_curve_is_one_edge_and_closes_if_it_is_closed(generator, curve, c
     assert len(found.arcs) == 1 and counts["loop" if closed else "curve"] == 1
     off = cKDTree(edges.sample(5e-4)[0]).query(curve(fine))[0]
     assert off.max() < 3e-3
+
+
+def test_a_chain_takes_no_points_from_a_piece_it_does_not_cover(generator):
+    """Two arcs of a wave, and a third piece of which the wave is a small part only: that one keeps its points."""
+    t = np.linspace(0, 1, 400)
+    away = np.stack([np.linspace(0.1, 0.9, 600), np.full(600, 0.9), np.full(600, 0.9)], axis=1)
+    points = np.concatenate([wave(t), away]) + generator.normal(0, 2e-4, (1000, 3))
+    along = np.concatenate([wave(t + 1e-4) - wave(t - 1e-4), np.tile([1.0, 0, 0], (600, 1))])
+    cloud = Cloud(points, along / np.linalg.norm(along, axis=1, keepdims=True), Scale(2e-4, np.radians(1.0), 0.03))
+    straight = Arc(np.zeros(3), np.array([1.0, 0, 0]), np.zeros(3), 0.0, 0.1, False)
+    parts = [np.arange(0, 150), np.arange(150, 350), np.arange(350, 1000)]
+    pieces = [Piece(straight, None, own, np.zeros(0, int), np.zeros(len(own)), 0.0) for own in parts]
+    curves, replaced = free_curves(cloud, pieces, ClusterConfig())
+    assert replaced == {0, 1} and len(curves) == 1
+    assert np.isin(curves[0], np.arange(350)).all() and len(curves[0]) > 300

@@ -120,6 +120,8 @@ def read_picture(path, shape):
     An image of another size than the edge map says nothing about its pixels.
     """
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path else None
+    if image is not None and image.dtype == np.uint16:
+        image = (image // 257).astype(np.uint8)
     if image is None or image.shape[:2] != shape or image.dtype != np.uint8:
         return None, None
     if image.ndim == 2:

@@ -60,12 +60,8 @@ def assemble(points, directions, config):
     neighbors = [row[good] for row, good in zip(graph.indices, follows, strict=True)]
     cloud = Cloud(points, directions, measured_scale(points, directions, neighbors, seeds, config.max_gap))
     found, ledger = claims(cloud, neighbors, seeds, config.min_points)
-    pieces, free = merged(cloud, found, ledger.noise), []
-    replaced = set()
-    for members, own in free_curves(cloud, pieces, config):
-        if not own & replaced:
-            replaced |= own
-            free.append(members)
+    pieces = merged(cloud, found, ledger.noise)
+    free, replaced = free_curves(cloud, pieces, config)
     pieces = [piece for number, piece in enumerate(pieces) if number not in replaced]
     labels, shared = np.full(len(points), UNASSIGNED), [np.zeros((0, 2), int)]
     for number, piece in enumerate(pieces):

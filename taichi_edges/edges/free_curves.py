@@ -19,10 +19,12 @@ WITHIN = 0.9  # of a piece's points, which must be the chain's for the piece to 
 
 
 def free_curves(cloud, pieces, config):
-    """(member indices of the chain, set of the pieces it replaces) of every free curve.
+    """The point indices of every free curve, and the set of the numbers of the pieces that these replace.
 
-    cloud: Cloud. pieces: list of Pieces. config: the scene's `cluster` section.
+    cloud: Cloud. pieces: list of Pieces. config: the scene's `cluster` section. A chain that runs on into a piece it
+    does not cover leaves that its points: it explains them already.
     """
+    curves, replaced = [], set()
     piece_at = np.full(len(cloud.points), -1)
     for number, piece in enumerate(pieces):
         piece_at[piece.own] = number
@@ -30,10 +32,13 @@ def free_curves(cloud, pieces, config):
     for members in members_of_clusters(separate_branches(cloud.points, traversed, config.min_points)):
         inside = np.bincount(piece_at[members] + 1, minlength=len(pieces) + 1)[1:]
         own = [number for number in np.flatnonzero(inside) if inside[number] >= WITHIN * len(pieces[number].own)]
+        members = members[np.isin(piece_at[members], [-1, *own])]
         if len(own) >= 2 and not any(pieces[number].closed for number in own):  # a circle is no part of a chain
             cost = cost_of_pieces(cloud, [pieces[number] for number in own], members)
             if cost_of_chain(cloud, members, cost) < cost:
-                yield members, set(own)
+                curves.append(members)
+                replaced.update(own)
+    return curves, replaced
 
 
 def cost_of_pieces(cloud, pieces, members):
