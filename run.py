@@ -5,7 +5,7 @@ import argparse
 import os
 import sys
 
-STAGES = ("prepare", "train", "cluster", "fit", "evaluate", "export")
+STAGES = ("prepare", "train", "cluster", "fit", "refine", "evaluate", "export")
 
 
 class OneLineParser(argparse.ArgumentParser):

@@ -15,8 +15,10 @@ MOST_THREADS = 256  # each has a plane of its own to draw into
 def run_command(options):
     """Run what the parsed command line `options` asks for; mistakes of the user raise UserError."""
     config = load_scene(options.scene, options.preset, options.set, options.seed)
-    if options.show and options.until and list(STAGES).index(options.until) < list(STAGES).index("fit"):
-        raise UserError(f"--show needs the edges, but --until {options.until} stops before fit; leave one of them out")
+    if options.show and options.until and list(STAGES).index(options.until) < list(STAGES).index("refine"):
+        raise UserError(
+            f"--show needs the edges, but --until {options.until} stops before refine; leave one of them out"
+        )
     run = Run(
         config=config,
         folder=Path(options.out) / config.name,
@@ -103,7 +105,7 @@ def show(run):
 
     for artefact in ("points.ply", "edges.json"):
         if not run.path(artefact).exists():
-            raise UserError(f"{run.path(artefact)}: not there yet; --show needs the fit stage, run without --until")
+            raise UserError(f"{run.path(artefact)}: not there yet; --show needs the refine stage, run without --until")
     points, directions = read_oriented_points(run.path("points.ply"))
     files = [str(run.path(name)) for name in ("points.ply", "edges.ply", "edges.obj", "overlays.png")]
     show_window(points, directions, read_edges(run.path("edges.json"))[0], files)

@@ -70,6 +70,11 @@ def describe_fit(facts):
     )
 
 
+def describe_refine(facts):
+    """'33 edges that meet in 20 vertices'."""
+    return f"{amount(facts['edges'], 'edge')}, {amount(facts['vertices'], 'vertex', 'vertices')}"
+
+
 def describe_evaluate(facts):
     """'F-score 72.6 % at 5 mm, 73.5 % at 10 mm, 74.6 % at 20 mm', or that there is no ground truth."""
     if facts["ground_truth"] is None:
@@ -89,6 +94,7 @@ FINDINGS = {
     "train": describe_train,
     "cluster": describe_cluster,
     "fit": describe_fit,
+    "refine": describe_refine,
     "evaluate": describe_evaluate,
     "export": describe_export,
 }

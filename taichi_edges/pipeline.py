@@ -72,7 +72,10 @@ STAGES = {
         ("points.ply", "clusters.npz"),
         on_device=True,
     ),
-    "fit": Stage(stages.fit, ("fit", "name", "seed"), ("clusters.npz", "views.npz"), ("edges.json",)),
+    "fit": Stage(stages.fit, ("fit", "name", "seed"), ("clusters.npz", "views.npz"), ("edges_fit.json",)),
+    "refine": Stage(
+        stages.refine, ("refine", "seed"), ("edges_fit.json", "views.npz"), ("edges.json",), on_device=True
+    ),
     "evaluate": Stage(
         stages.evaluate,
         ("evaluation",),

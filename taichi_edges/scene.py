@@ -209,6 +209,15 @@ class FitConfig(Section):
     min_length: NotNegative = Field(0.01, description="shorter edges are reported and left out, unit-cube units")
 
 
+class RefineConfig(Section):
+    """From single edges to a connected wireframe that agrees with the images (beyond the paper)."""
+
+    enabled: bool = Field(False, description="false: the edges stay as they were fitted")
+    regularise: bool = Field(
+        False, description="make edges parallel, perpendicular, coplanar, of equal radius, where the images allow it"
+    )
+
+
 class EvaluationConfig(Section):
     """Ground truth, where there is one."""
 
@@ -230,6 +239,7 @@ class SceneConfig(Section):
     filter: FilterConfig = FilterConfig()
     cluster: ClusterConfig = ClusterConfig()
     fit: FitConfig = FitConfig()
+    refine: RefineConfig = RefineConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
 
     @field_validator("calibration", mode="before")
@@ -287,6 +297,7 @@ PRESETS = {
         },
         "calibration": {"shift": "off", "silhouette": "off"},
         "filter": {"refine": False},
+        "refine": {"enabled": False},
     },
     # Seeded where the views agree, so that a few passes are enough: faster rates, one smooth decay, no duplication.
     "fast": {
@@ -316,5 +327,6 @@ PRESETS = {
         },
         "calibration": {"shift": "auto", "silhouette": "auto"},
         "filter": {"refine": True},
+        "refine": {"enabled": True},
     },
 }

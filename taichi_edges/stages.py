@@ -20,6 +20,7 @@ from taichi_edges.cameras import transform
 from taichi_edges.edge_set import read_edges, write_edges
 from taichi_edges.errors import UserError, did_you_mean
 from taichi_edges.views import read_views, write_views
+from taichi_edges.wireframe import read_wireframe, write_wireframe
 
 WIDEST_PX = 40.0  # of a detector's lines
 CALIBRATION_SEEDS = 4000  # 3D points through which a detector's biases are measured, at most
@@ -293,7 +294,7 @@ def _in_words(counts):
 
 
 def fit(run):
-    """`clusters.npz` -> `edges.json` (input frame)."""
+    """`clusters.npz` -> `edges_fit.json` (input frame): edges that do not meet yet."""
     from taichi_edges.edges.assembly import fit_assembly
 
     views = read_views(run.path("views.npz"))
@@ -302,11 +303,32 @@ def fit(run):
         edges, counts = fit_assembly(*parts, run.config.fit)
     clusters = {kind: counts[kind] for kind in ("line", "curve", "loop", "short", "degenerate")}
     about = {"frame": "input", "clusters": clusters, "scene": run.config.name, "seed": run.config.seed}
-    write_edges(run.path("edges.json"), edges.transformed(views.similarity.to_input), about)
+    write_wireframe(run.path("edges_fit.json"), _in_input_frame(edges, views), about)
     if len(edges) == 0:
         run.progress.warn(f"no edge was found in {sum(clusters.values())} clusters; see the counts in run.json")
     kinds = {f"{kind}_clusters": count for kind, count in clusters.items()}
-    return {"lines": len(edges.lines), "curves": len(edges.curves), **kinds}
+    pieces = edges.edge_set()
+    return {"lines": len(pieces.lines), "curves": len(pieces.curves), **kinds}
+
+
+def _in_input_frame(wireframe, views):
+    """A Wireframe in the unit cube, in the frame of the input."""
+    return wireframe.transformed(views.similarity.to_input, 1.0 / views.similarity.scale)
+
+
+def refine(run):
+    """`edges_fit.json`, `views.npz` -> `edges.json` (input frame): edges that meet, and what the images say of each."""
+    from taichi_edges.edges.refinement import refine_wireframe
+    from taichi_edges.kernels.device import is_running, start_taichi
+
+    views = read_views(run.path("views.npz"))
+    loose, about = read_wireframe(run.path("edges_fit.json"))
+    loose = loose.transformed(views.similarity.to_unit, views.similarity.scale)
+    if not is_running(run.arch, run.threads):
+        start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)
+    wireframe, counts = refine_wireframe(loose, views, run.config.refine)
+    write_wireframe(run.path("edges.json"), _in_input_frame(wireframe, views), about)
+    return {"edges": len(wireframe), "vertices": len(wireframe.vertices), **asdict(counts)}
 
 
 def truth_path(run):

@@ -88,7 +88,7 @@ def test_pipeline_prints_stages_and_metrics(run, tmp_path):
     text = run("benchmarks/pipeline.py", "--scene", scene, lost, "--threads", 2)
     seconds, memory, found = read_tables(text)
     assert seconds[0]["scene"] == memory[0]["scene"] == found[0]["scene"] == "tiny" and len(seconds) == 1
-    stages = ("prepare", "train", "cluster", "fit", "evaluate", "export")
+    stages = ("prepare", "train", "cluster", "fit", "refine", "evaluate", "export")
     assert float(seconds[0]["whole command"]) > sum(float(seconds[0][stage]) for stage in stages) > 0
     assert float(seconds[0]["peak MiB"]) >= max(float(memory[0][stage]) for stage in stages) > 50
     assert found[0]["edges (true)"].endswith("(12)")

@@ -31,11 +31,11 @@ from taichi_edges.edges.filtering import filter_points, statistical_inliers
 from taichi_edges.edges.fitting import (
     BENDING,
     _lsq_chain,
-    edges_of,
     fit_cluster,
     fit_curve,
     fit_line,
     nearest_on_chain,
+    wireframe_of,
 )
 from taichi_edges.edges.ordering import _bridge, connected_graph, order_points
 from taichi_edges.errors import UserError
@@ -301,7 +301,11 @@ def test_noisy_line_is_a_line_within_the_noise(seed):
     start, end = np.array([0.1, 0.2, 0.3]), np.array([0.8, 0.5, 0.9])
     fit = fit_cluster(noisy_line(start, end, 150, NOISE, seed)[0], FitConfig())
     assert fit.kind == "line"
-    ends = fit.line if np.linalg.norm(fit.line[0] - start) < np.linalg.norm(fit.line[1] - start) else fit.line[::-1]
+    ends = (
+        fit.shape.points
+        if np.linalg.norm(fit.shape.points[0] - start) < np.linalg.norm(fit.shape.points[1] - start)
+        else fit.shape.points[::-1]
+    )
     across = np.cross(ends - start, (end - start) / np.linalg.norm(end - start))
     # The line's standard error is 2 * NOISE / sqrt(150) at its ends; the ends themselves lie a few spacings off.
     assert np.linalg.norm(across, axis=1).max() < 5 * 2 * NOISE / np.sqrt(150)
@@ -320,36 +324,36 @@ def test_outliers_do_not_spoil_a_line(seed):
     strays = np.random.default_rng(seed).uniform((0.3, 0.55, 0.55), (0.7, 0.7, 0.7), (20, 3))
     fit = fit_cluster(np.concatenate([points, strays]), FitConfig())
     assert fit.kind == "line"
-    assert np.linalg.norm(fit.line[:, 1:] - 0.5, axis=1).max() < NOISE
-    np.testing.assert_allclose(np.sort(fit.line[:, 0]), [0, 1], atol=0.015)
+    assert np.linalg.norm(fit.shape.points[:, 1:] - 0.5, axis=1).max() < NOISE
+    np.testing.assert_allclose(np.sort(fit.shape.points[:, 0]), [0, 1], atol=0.015)
 
 
 def test_one_stray_point_does_not_lengthen_a_line():
     points, _ = noisy_line((0, 0, 0), (0.5, 0, 0), 150, NOISE / 4)
     fit = fit_cluster(np.concatenate([points, [[0.6, 0, 0]]]), FitConfig())
-    assert fit.kind == "line" and fit.line[:, 0].max() < 0.51
+    assert fit.kind == "line" and fit.shape.points[:, 0].max() < 0.51
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_noisy_arc_is_a_curve_on_the_arc(seed):
     fit = fit_cluster(noisy_arc(0.3, 0, 2.0, 120, NOISE, seed)[0], FitConfig())
     assert fit.kind == "curve"
-    samples = evaluate_bezier(fit.curves, np.linspace(0, 1, 50)).reshape(-1, 3) - CENTRE
+    samples = evaluate_bezier(fit.shape.curves, np.linspace(0, 1, 50)).reshape(-1, 3) - CENTRE
     assert np.abs(np.linalg.norm(samples, axis=1) - 0.3).max() < 3 * NOISE
-    assert bezier_lengths(fit.curves).sum() == pytest.approx(0.6, abs=0.03)
+    assert bezier_lengths(fit.shape.curves).sum() == pytest.approx(0.6, abs=0.03)
 
 
 @pytest.mark.parametrize("count", [60, 200, 600])
 def test_full_circle_is_a_loop_whose_pieces_meet_smoothly_on_the_circle(count):
     fit = fit_cluster(noisy_arc(0.3, 0, 2 * np.pi, count)[0], FitConfig())
     assert fit.kind == "loop"
-    first, last = fit.curves[:, 0], fit.curves[:, 3]
+    first, last = fit.shape.curves[:, 0], fit.shape.curves[:, 3]
     np.testing.assert_array_equal(first, np.roll(last, 1, axis=0))
-    away = fit.curves[:, 1] - first
-    towards = np.roll(last - fit.curves[:, 2], 1, axis=0)
+    away = fit.shape.curves[:, 1] - first
+    towards = np.roll(last - fit.shape.curves[:, 2], 1, axis=0)
     cosines = (away * towards).sum(axis=1) / np.linalg.norm(away, axis=1) / np.linalg.norm(towards, axis=1)
     assert cosines.min() > np.cos(np.radians(2))
-    samples = evaluate_bezier(fit.curves, np.linspace(0, 1, 100)).reshape(-1, 3) - CENTRE
+    samples = evaluate_bezier(fit.shape.curves, np.linspace(0, 1, 100)).reshape(-1, 3) - CENTRE
     assert np.abs(np.linalg.norm(samples, axis=1) - 0.3).max() < 1e-3
     assert np.abs(samples[:, 2]).max() < 1e-3
 
@@ -360,10 +364,10 @@ def test_s_shape_is_one_smooth_curve_along_both_arcs():
     points = np.concatenate([upper, lower])
     fit = fit_cluster(points, FitConfig())
     assert fit.kind == "curve"
-    distances, _ = nearest_on_chain(points, fit.curves)
+    distances, _ = nearest_on_chain(points, fit.shape.curves)
     assert distances.mean() < NOISE / 2 and distances.max() < 0.006  # the curvature jumps in the middle
-    np.testing.assert_array_equal(fit.curves[1:, 0], fit.curves[:-1, 3])
-    assert bezier_lengths(fit.curves).sum() == pytest.approx(2 * np.pi * 0.2, rel=0.03)
+    np.testing.assert_array_equal(fit.shape.curves[1:, 0], fit.shape.curves[:-1, 3])
+    assert bezier_lengths(fit.shape.curves).sum() == pytest.approx(2 * np.pi * 0.2, rel=0.03)
 
 
 def test_delta_decides_between_line_and_curve():
@@ -380,7 +384,7 @@ def test_two_identical_points_are_degenerate():
 def test_a_handful_of_points_in_a_row_is_a_line(count):
     fit = fit_cluster(np.linspace(0, 0.1, count)[:, None] * [1.0, 0, 0], FitConfig())
     assert fit.kind == "line"
-    np.testing.assert_allclose(np.sort(fit.line[:, 0]), [0, 0.1], atol=1e-12)
+    np.testing.assert_allclose(np.sort(fit.shape.points[:, 0]), [0, 0.1], atol=1e-12)
 
 
 def test_every_cluster_is_counted_once():
@@ -395,14 +399,17 @@ def test_every_cluster_is_counted_once():
     unassigned = np.random.default_rng(0).random((30, 3))
     points, labels = np.concatenate([points, unassigned]), np.concatenate([labels, np.full(30, UNASSIGNED)])
     config = FitConfig(min_length=0.01)
-    edges, counts = edges_of(fit_cluster(points[members], config) for members in members_of_clusters(labels))
+    edges, counts = wireframe_of(fit_cluster(points[members], config) for members in members_of_clusters(labels))
     assert counts == {"line": 1, "curve": 1, "loop": 1, "short": 1, "degenerate": 1}
-    assert edges.line_sources.tolist() == [0] and set(edges.curve_sources.tolist()) == {1, 2}
-    assert len(edges.line_sources) == len(edges.lines) and len(edges.curve_sources) == len(edges.curves)
+    assert [shape.kind for shape in edges.shapes] == ["line", "spline", "spline"]
+    assert [shape.closed for shape in edges.shapes] == [False, False, True]
+    pieces = edges.edge_set()
+    assert pieces.line_sources.tolist() == [0] and set(pieces.curve_sources.tolist()) == {1, 2}
+    assert len(pieces.curve_sources) == len(pieces.curves)
 
 
 def test_no_clusters_give_no_edges():
-    edges, counts = edges_of([])
+    edges, counts = wireframe_of([])
     assert len(edges) == 0 and sum(counts.values()) == 0
 
 

@@ -95,7 +95,8 @@ KILLED_IN = {
     "train": "from taichi_edges.exporters import splats; splats.write_gaussians = write_half",
     # between points.ply and clusters.npz
     "cluster": "stages.np.savez_compressed = die",
-    "fit": "stages.write_edges = write_half",
+    "fit": "stages.write_wireframe = write_half",
+    "refine": "from taichi_edges.edges import refinement; refinement.refine_wireframe = die",
     # between metrics.json and metrics.csv
     "evaluate": "stages._write_csv = write_half",
     "export": "from taichi_edges.exporters import overlays; overlays.contact_sheet = die",
@@ -233,7 +234,7 @@ def test_everything_exported_is_in_the_frame_of_the_input(finished, tmp_path):
     content["box"] = [[-1000, -1000, -1000], [1000, 1000, 1000]]
     content["train"]["learning_rates"]["scales"] = 0.0  # so that the Gaussians keep the scale they start with
     (tmp_path / "large.yaml").write_text(json.dumps(content))
-    succeed(command(tmp_path / "large.yaml", tmp_path / "runs", "--until", "fit"))
+    succeed(command(tmp_path / "large.yaml", tmp_path / "runs", "--until", "refine"))
     truth, _ = read_edges(runs / "tiny/truth.json")
     on_edges = cKDTree(2000 * truth.sample(0.002)[0] - 1000)
     _, log_scales, _, _ = read_gaussians(tmp_path / "runs/large/gaussians.ply")
@@ -336,7 +337,7 @@ def test_changing_the_training_runs_from_train_on(copied):
 
 def test_changing_the_fit_runs_from_fit_on(copied):
     record, said = rerun(copied, ["fit.delta=0.9", "fit.min_length=0.2"])
-    assert said.states() == states(ran=("fit", "evaluate", "export"), skipped=("prepare", "train", "cluster"))
+    assert said.states() == states(ran=("fit", "refine", "evaluate", "export"), skipped=("prepare", "train", "cluster"))
     assert record["stages"]["fit"]["inputs"]["settings"]["fit"]["delta"] == 0.9
     assert rerun(copied, ["fit.delta=0.9", "fit.min_length=0.2"])[1].states() == states((), STAGES)
 
@@ -344,7 +345,9 @@ def test_changing_the_fit_runs_from_fit_on(copied):
 def test_a_stage_whose_inputs_come_out_the_same_is_skipped(copied):
     """The cluster stage has to run for its changed setting, but its clusters are the same, so fit need not."""
     _, said = rerun(copied, ["filter.harvest=false"])  # of no effect without filter.refine
-    assert said.states() == states(ran=("cluster",), skipped=("prepare", "train", "fit", "evaluate", "export"))
+    assert said.states() == states(
+        ran=("cluster",), skipped=("prepare", "train", "fit", "refine", "evaluate", "export")
+    )
 
 
 def test_stage_starts_there_and_reuses_what_is_before(copied):
@@ -352,8 +355,8 @@ def test_stage_starts_there_and_reuses_what_is_before(copied):
     gaussians = (folder / "gaussians.ply").stat().st_mtime_ns
     edges = (folder / "edges.json").read_bytes()
     record, said = rerun(copied, stage="cluster")
-    assert said.states() == states(ran=("cluster", "fit", "evaluate", "export"), skipped=())
-    assert record["ran"] == ["cluster", "fit", "evaluate", "export"]
+    assert said.states() == states(ran=("cluster", "fit", "refine", "evaluate", "export"), skipped=())
+    assert record["ran"] == ["cluster", "fit", "refine", "evaluate", "export"]
     assert (folder / "gaussians.ply").stat().st_mtime_ns == gaussians
     assert (folder / "edges.json").read_bytes() == edges
 
@@ -381,7 +384,7 @@ def test_a_hand_edited_artefact_is_noticed_and_made_again(copied):
     before = (folder / "edges.json").read_bytes()
     (folder / "edges.json").write_bytes(before.replace(b'"input"', b'"other"'))
     _, said = rerun(copied)
-    assert "fit again (edges.json: is not the file that the fit stage wrote)" in said.lines
+    assert "refine again (edges.json: is not the file that the refine stage wrote)" in said.lines
     assert (folder / "edges.json").read_bytes() == before
 
 
@@ -603,7 +606,7 @@ def test_a_kill_leaves_a_finished_run_of_other_settings_noticed(copied):
 def test_one_seed_gives_the_same_edges_and_another_seed_others(finished, tmp_path):
     """The killed run above is the second run with one seed; here the prepared views come anew with another."""
     scene, runs, _ = finished
-    succeed(command(scene, tmp_path, "--seed", "1", "--until", "fit"))
+    succeed(command(scene, tmp_path, "--seed", "1", "--until", "refine"))
     other, first = tmp_path / "tiny" / "edges.json", runs / "tiny" / "edges.json"
     assert other.read_bytes() != first.read_bytes()
     assert read_edges(other)[1]["seed"] == 1

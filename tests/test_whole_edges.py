@@ -70,7 +70,7 @@ def observed(*parts, noise=2e-4, seed=0):
 def edges_of(points, directions):
     """The Assembly and the EdgeSet of oriented points."""
     found = assemble(points, directions, ClusterConfig())
-    return found, fit_assembly(points, found.labels, found.shared, found.arcs, FitConfig())[0]
+    return found, fit_assembly(points, found.labels, found.shared, found.arcs, FitConfig())[0].edge_set()
 
 
 def count_edges(edges):
@@ -317,7 +317,7 @@ def test_a_free_curve_is_one_edge_and_closes_if_it_is_closed(generator, curve, c
     found = assemble(points, along / np.linalg.norm(along, axis=1, keepdims=True), ClusterConfig())
     edges, counts = fit_assembly(points, found.labels, found.shared, found.arcs, FitConfig())
     assert len(found.arcs) == 1 and counts["loop" if closed else "curve"] == 1
-    off = cKDTree(edges.sample(5e-4)[0]).query(curve(fine))[0]
+    off = cKDTree(edges.edge_set().sample(5e-4)[0]).query(curve(fine))[0]
     assert off.max() < 3e-3
 
 

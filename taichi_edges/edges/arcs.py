@@ -9,6 +9,8 @@ from functools import cached_property
 
 import numpy as np
 
+from taichi_edges.shapes import EllipticArc, Line
+
 FLAT = 1e-9  # bend, 1 / unit-cube units, below which an arc is computed as a line
 QUARTER = 0.5 * np.pi
 GAUSS_NEWTON = 3  # rounds; they converge quadratically
@@ -100,6 +102,15 @@ class Arc:
             places[-1], tangents[-1] = places[0], tangents[0]
         starts, ends = places[:-1], places[1:]
         return np.stack([starts, starts + handle * tangents[:-1], ends - handle * tangents[1:], ends], axis=1)
+
+    def shape(self):
+        """The Line or EllipticArc it is."""
+        if self.curvature <= FLAT:
+            return Line(self.at(np.array([self.low, self.high])))
+        tangent, inward, _ = self.frame
+        axes = np.array([-inward, tangent]) / self.curvature
+        low, high = self.low * self.curvature, self.high * self.curvature
+        return EllipticArc(self.origin + inward / self.curvature, axes, low, high)
 
     def over(self, low, high):
         """The same arc with other ends; closed if these are a round apart."""

@@ -16,11 +16,12 @@ from taichi_edges.edges.clustering import (
     neighbor_graph,
     seed_order,
 )
-from taichi_edges.edges.fitting import NOISE_FLOOR, Fit, edges_of, fit_cluster, fit_line
+from taichi_edges.edges.fitting import NOISE_FLOOR, Fit, fit_cluster, fit_line, wireframe_of
 from taichi_edges.edges.free_curves import free_curves
 from taichi_edges.edges.merging import merged
 from taichi_edges.edges.noise import measured_scale
 from taichi_edges.edges.segmentation import split_clusters
+from taichi_edges.shapes import Line
 
 HALO = 0.5  # of a point's neighbours: where so many lie on an edge, the point is a stray one of it
 ARC_NUMBERS = 12  # origin, tangent, bend; low, high, closed
@@ -114,7 +115,7 @@ def unpack_arc(numbers):
 
 
 def fit_assembly(points, labels, shared, arcs, config):
-    """The EdgeSet of an Assembly, whose sources are the labels, and the dict kind -> number of edges.
+    """The loose Wireframe of an Assembly, and the dict kind -> number of edges.
 
     points: (n, 3) unit cube; the others as in Assembly. config: the scene's `fit` section.
     """
@@ -122,7 +123,7 @@ def fit_assembly(points, labels, shared, arcs, config):
     also = sharers(shared, len(arcs))
     members = [np.concatenate(pair) for pair in zip(own, also, strict=True)]
     fits = (fit_edge(points[some], unpack_arc(arc), config) for some, arc in zip(members, arcs, strict=True))
-    return edges_of(fits)
+    return wireframe_of(fits)
 
 
 def sharers(shared, count):
@@ -139,6 +140,6 @@ def fit_edge(points, arc, config):
     if arc.curvature > 0:
         error = np.linalg.norm(arc.coordinates(points)[1], axis=1).mean()
         if max(error, NOISE_FLOOR) <= config.delta * fit_line(points, config.line_tolerance)[1]:
-            return Fit("loop" if arc.closed else "curve", curves=arc.cubics())
-        return Fit("line", line=fit_line(points, config.line_tolerance)[0])
-    return Fit("line", line=arc.at(np.array([arc.low, arc.high])))
+            return Fit("loop" if arc.closed else "curve", arc.shape())
+        return Fit("line", Line(fit_line(points, config.line_tolerance)[0]))
+    return Fit("line", arc.shape())

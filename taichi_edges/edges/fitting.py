@@ -1,13 +1,15 @@
 """One parametric edge for each cluster: a line segment, or a smooth chain of cubic Bezier curves (paper 3.3)."""
 
-from dataclasses import dataclass, field
+from collections import Counter
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from taichi_edges.bezier import bernstein, evaluate_bezier
-from taichi_edges.edge_set import EdgeSet
 from taichi_edges.edges.ordering import order_points
+from taichi_edges.shapes import EllipticArc, Line, Spline
+from taichi_edges.wireframe import Wireframe
 
 ROBUST_ROUNDS = 10
 REPARAMETRIZATIONS = 4
@@ -25,28 +27,17 @@ CURVE_SAMPLES = 128  # for each cubic, where distances to a curve are measured
 
 @dataclass(frozen=True)
 class Fit:
-    """What became of one cluster: 'line', 'curve', 'loop' (a closed curve), 'short' or 'degenerate'."""
+    """What became of one cluster: a shape of kind 'line', 'curve' or 'loop' (closed); 'short' or 'degenerate': None."""
 
     kind: str
-    line: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 3)))
-    curves: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 3)))
+    shape: Line | EllipticArc | Spline | None = None
 
 
-def edges_of(fits):
-    """The EdgeSet of some Fits, whose sources are their numbers, and the dict kind -> how many there are."""
-    lines, curves, line_sources, curve_sources = [], [], [], []
-    counts = dict.fromkeys(("line", "curve", "loop", "short", "degenerate"), 0)
-    for label, fit in enumerate(fits):
-        counts[fit.kind] += 1
-        if fit.kind == "line":
-            lines.append(fit.line)
-            line_sources.append(label)
-        elif fit.kind in ("curve", "loop"):
-            curves.extend(fit.curves)
-            curve_sources.extend([label] * len(fit.curves))
-    edges = EdgeSet.of(lines, curves)
-    sources = (np.array(line_sources, dtype=np.int64), np.array(curve_sources, dtype=np.int64))
-    return EdgeSet(edges.lines, edges.curves, *sources), counts
+def wireframe_of(fits):
+    """The loose Wireframe of some Fits, and the dict kind -> how many there are."""
+    fits = list(fits)
+    counts = dict.fromkeys(("line", "curve", "loop", "short", "degenerate"), 0) | Counter(fit.kind for fit in fits)
+    return Wireframe.loose([fit.shape for fit in fits if fit.shape is not None]), counts
 
 
 def fit_cluster(points, config):
@@ -63,10 +54,10 @@ def fit_cluster(points, config):
         curves, curve_error = fit_curve(points, ordering, config.line_tolerance)
         long_enough = np.linalg.norm(np.diff(evaluate_bezier(curves, [0, 0.5, 1]), axis=1), axis=2).sum()
         if max(curve_error, NOISE_FLOOR) <= config.delta * line_error and long_enough >= config.min_length:
-            return Fit("loop" if ordering.closed else "curve", curves=curves)
+            return Fit("loop" if ordering.closed else "curve", Spline(curves, ordering.closed))
     if np.linalg.norm(line[1] - line[0]) < config.min_length:
         return Fit("short")
-    return Fit("line", line=line)
+    return Fit("line", Line(line))
 
 
 def fit_line(points, tolerance):
