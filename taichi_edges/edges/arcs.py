@@ -109,7 +109,8 @@ class Arc:
             return Line(self.at(np.array([self.low, self.high])))
         tangent, inward, _ = self.frame
         axes = np.array([-inward, tangent]) / self.curvature
-        low, high = self.low * self.curvature, self.high * self.curvature
+        low = self.low * self.curvature
+        high = low + 2 * np.pi if self.closed else self.high * self.curvature
         return EllipticArc(self.origin + inward / self.curvature, axes, low, high)
 
     def over(self, low, high):
