@@ -1,0 +1,195 @@
+"""Strokes that continue each other become one edge, and those that repeat another one go.
+
+Three passes. An arc whose circle goes on along other strokes becomes that circle. Strokes that follow each other
+smoothly form a path, and the path is cut anew into as few shapes as pay (`model_selection`), by dynamic programming
+over all ways to cut it. A stroke that lies beside others on its whole length repeats them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from taichi_edges.edges.model_selection import (
+    Track,
+    best_shape,
+    distances_to,
+    observations,
+    price_of,
+    track_of,
+)
+
+BESIDE = 3.0  # noises: places so near to a shape are on it
+PARALLEL = np.cos(np.radians(20.0))
+JOINT_COSINE = np.cos(np.radians(25.0))  # between the tangents of two strokes that continue each other
+JOINT_GAP_PX = 12.0  # between their ends, along; a tail or a gap at a touching edge is as long
+JOINT_ASIDE = 0.25  # of that gap: how far aside the other end may lie, beyond BESIDE
+LONGEST_RUN = 8  # strokes that may become one at once
+FOLLOWED = 0.5  # of the places of a stroke that the shape which replaces it runs along, at least
+REPEATED = 0.9  # of the places of a stroke beside others, from which on it says nothing new
+
+
+@dataclass(frozen=True)
+class Merging:
+    """Numbers for the log: circles completed, strokes that were joined to others, strokes that repeated others."""
+
+    circles: int = 0
+    joined: int = 0
+    duplicates: int = 0
+
+
+def continued(shapes, yardstick, pixel):
+    """The shapes after all three passes, and Merging.
+
+    shapes: list of shapes in the unit cube. yardstick: Yardstick. pixel: size of a pixel, unit-cube units.
+    """
+    chained = rejoined(shapes, yardstick, pixel)
+    single = without_repeats(chained, yardstick, pixel)
+    return single, Merging(0, len(shapes) - len(chained), len(chained) - len(single))
+
+
+# ---------------------------------------------------------------------------------------------------- smooth paths
+
+
+def rejoined(shapes, yardstick, pixel):
+    """The shapes, each path of strokes that continue each other cut anew into as few as pay."""
+    paths = smooth_paths(shapes, yardstick, pixel)
+    return [shape for path in paths for shape in cut_anew(shapes, path, yardstick, pixel)]
+
+
+def smooth_paths(shapes, yardstick, pixel):
+    """Lists of (index, reversed) of strokes that continue each other; every shape is in one of them."""
+    partner = joints(shapes, yardstick, pixel)
+    paths, seen = [], set()
+    ends = [(number, side) for number, shape in enumerate(shapes) for side in (0, 1)]
+    starts = [end for end in ends if end not in partner] + ends  # open paths first, then what goes round
+    for number, side in starts:
+        if number in seen:
+            continue
+        path = []
+        while number not in seen:
+            seen.add(number)
+            path.append((number, side == 1))
+            onward = partner.get((number, 1 - side))
+            if onward is None:
+                break
+            number, side = onward
+        paths.append(path)
+    return paths
+
+
+def joints(shapes, yardstick, pixel):
+    """{(shape, side): (shape, side)} of ends that continue each other, each the best for the other."""
+    ends = [(number, side) for number, shape in enumerate(shapes) if not shape.closed for side in (0, 1)]
+    if len(ends) < 2:
+        return {}
+    places = np.array([shapes[number].ends[side] for number, side in ends])
+    outward = np.array([(2 * side - 1) * shapes[number].tangents(float(side)) for number, side in ends])
+    found = []
+    for i, j in sorted(cKDTree(places).query_pairs(JOINT_GAP_PX * pixel)):
+        if ends[i][0] == ends[j][0] or outward[i] @ outward[j] > -JOINT_COSINE:
+            continue
+        step = places[j] - places[i]
+        along = _unit(outward[i] - outward[j])
+        aside = np.linalg.norm(step - (step @ along) * along)
+        if aside <= BESIDE * yardstick.noise + JOINT_ASIDE * abs(step @ along):
+            turn = np.arccos(np.clip(-outward[i] @ outward[j], -1, 1))
+            found.append((aside / yardstick.noise + turn / np.radians(5.0) + abs(step @ along) / (4 * pixel), i, j))
+    partner = {}
+    for _, i, j in sorted(found):
+        if ends[i] not in partner and ends[j] not in partner:
+            partner[ends[i]], partner[ends[j]] = ends[j], ends[i]
+    return partner
+
+
+def cut_anew(shapes, path, yardstick, pixel):
+    """The shapes that describe a path with the least cost (BIC), each over a run of its strokes."""
+    if len(path) == 1:
+        return [shapes[path[0][0]]]
+    tracks = [oriented(track_of(shapes[number], pixel), backward) for number, backward in path]
+    count = observations(np.concatenate([track.share for track in tracks]), yardstick)
+    least, choice = [0.0], []
+    for last in range(len(path)):
+        options = []
+        for first in range(max(0, last - LONGEST_RUN + 1), last + 1):
+            if first == last:
+                shape = shapes[path[last][0]]
+                options.append((least[first] + price_of(shape) * np.log(count), first, shape))
+            else:
+                run = tracks[first : last + 1]
+                shape, cost = best_shape(joined_track(run), yardstick, count)
+                if shape is not None and all(follows(shape, track, yardstick) for track in run):
+                    options.append((least[first] + cost, first, shape))
+        cost, first, shape = min(options, key=lambda option: option[0])
+        least.append(cost)
+        choice.append((first, shape))
+    cut, last = [], len(path) - 1
+    while last >= 0:
+        first, shape = choice[last]
+        cut.append(shape)
+        last = first - 1
+    return cut[::-1]
+
+
+def follows(shape, track, yardstick):
+    """Does the shape say most of what a Track says? Else a short stroke could be explained away by long ones."""
+    return (distances_to(shape, track.points) <= BESIDE * yardstick.noise).mean() >= FOLLOWED
+
+
+def oriented(track, backward):
+    """A Track run the other way round if `backward`."""
+    if not backward:
+        return track
+    length = track.arc[-1] + track.arc[0]
+    return Track(track.points[::-1], length - track.arc[::-1], track.share[::-1], track.closed)
+
+
+def joined_track(tracks):
+    """One Track of several that follow each other; where they overlap, places are in the order of the path."""
+    arcs, offset, before = [], 0.0, None
+    for track in tracks:
+        if before is not None:
+            heading = _unit(before.points[-1] - before.points[-2])
+            offset = (
+                arcs[-1][-1] + max((track.points[0] - before.points[-1]) @ heading, -before.share[-1]) - track.arc[0]
+            )
+        arcs.append(track.arc + offset)
+        before = track
+    points, share = (np.concatenate([getattr(track, name) for track in tracks]) for name in ("points", "share"))
+    arc = np.concatenate(arcs)
+    order = np.argsort(arc, kind="stable")
+    return Track(points[order], arc[order], share[order])
+
+
+# --------------------------------------------------------------------------------------------------------- repeats
+
+
+def without_repeats(shapes, yardstick, pixel):
+    """The shapes without those that lie beside longer ones on their whole length."""
+    kept = []
+    for number in sorted(range(len(shapes)), key=lambda number: -shapes[number].length):
+        track = track_of(shapes[number], pixel)
+        if not kept or beside_others(track, [shapes[other] for other in kept], yardstick).mean() < REPEATED:
+            kept.append(number)
+    return [shapes[number] for number in sorted(kept)]
+
+
+def beside_others(track, shapes, yardstick):
+    """(n,) bool: the places of a Track that lie on one of the shapes and run along it."""
+    along = np.gradient(track.points, axis=0)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
+    found = np.zeros(len(track.points), bool)
+    for shape in shapes:
+        near = distances_to(shape, track.points) <= BESIDE * yardstick.noise
+        if near.any():
+            places = shape.at(np.linspace(0, 1, 512))
+            nearest = cKDTree(places).query(track.points[near])[1]
+            tangents = shape.tangents(np.linspace(0, 1, 512))[nearest]
+            near[near] = np.abs((tangents * along[near]).sum(axis=1)) >= PARALLEL
+        found |= near
+    return found
+
+
+def _unit(vector):
+    """A vector of length 1."""
+    return vector / max(np.sqrt(vector @ vector), 1e-300)
