@@ -57,3 +57,14 @@ def circle_pieces(count, radius=0.2, centre=(0.5, 0.5, 0.5)):
     tangent = np.stack([-np.sin(angles), np.cos(angles), 0 * angles], axis=1) * handle
     pieces = np.stack([point[:-1], point[:-1] + tangent[:-1], point[1:] - tangent[1:], point[1:]], axis=1)
     return np.asarray(centre) + radius * pieces
+
+
+def assert_perfect(metrics):
+    """The metrics are those of a wireframe that is the truth."""
+    assert metrics["corners_closed"] == metrics["corners"]
+    assert metrics["tangential_joints_closed"] == metrics["tangential_joints"]
+    assert metrics["free_ends"] == metrics["true_free_ends"]
+    assert metrics["free_ends_at_corners"] == metrics["false_free_ends"] == 0
+    assert max(metrics["exact_p95_mm"], metrics["exact_completeness_p95_mm"]) < 0.02  # cubics fitted to the vertices
+    assert metrics["exact_precision_5mm_percent"] == metrics["exact_recall_5mm_percent"] == 100.0
+    assert abs(metrics["excess_duplicated_length_percent"]) < 0.1

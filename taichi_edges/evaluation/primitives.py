@@ -14,7 +14,7 @@ import numpy as np
 from taichi_edges.evaluation.dense_curves import STEP
 
 # Points at most this far apart, in normalised units, are one vertex. Joined edges share it exactly, but an edge that
-# ends on an arc is off the cubics which the arc is written as: by 2.7e-4 of its radius, 0.14 mm at the largest, 0.5.
+# ends on an arc is off the cubics which the arc is written as: by 2.7e-4 of its radius, 0.14 mm at a radius of 0.5.
 JOINED = 0.0002
 CORNER_DEGREES = 20.0  # edges that meet at less continue or touch each other
 SHAPE_TOLERANCE = 3e-4  # of the radius, or the length if less: a cubic of 90 degrees misses its circle by 2.7e-4
