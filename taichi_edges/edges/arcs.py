@@ -119,6 +119,22 @@ class Arc:
         return replace(self, low=low, high=low + self.round if whole else high, closed=bool(whole))
 
 
+def through_three(start, middle, end):
+    """The Arc from one point through another to a third, origin at the middle one; None where they are on a line."""
+    first, second = start - middle, end - middle
+    normal = cross(first, second)
+    double = normal @ normal
+    if double <= 1e-12 * (first @ first) * (second @ second):
+        return None
+    to_centre = cross((first @ first) * second - (second @ second) * first, normal) / (2 * double)
+    squared = to_centre @ to_centre
+    tangent = cross(normal, to_centre)
+    tangent /= np.sqrt(tangent @ tangent)
+    angles = [np.arctan2(way @ tangent * np.sqrt(squared), squared - way @ to_centre) for way in (first, second)]
+    low, high = (np.array([angles[0] % (2 * np.pi) - 2 * np.pi, angles[1] % (2 * np.pi)]) * np.sqrt(squared)).tolist()
+    return Arc(middle, tangent, to_centre / squared, low, high)
+
+
 def cross(a, b):
     """Cross product of two (3,) vectors; np.cross takes ten times as long for a single one."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taichi_edges.edges.arcs import Arc, cross, fit_arc
+from taichi_edges.edges.arcs import Arc, fit_arc, through_three
 from taichi_edges.edges.fitting import fit_chain, nearest_on_chain
 from taichi_edges.edges.ordering import Ordering
 from taichi_edges.shapes import Spline
@@ -144,21 +144,6 @@ def _spanning(arc, track):
     low, high = along[0], along[-1]
     assert low <= along[middle] + arc.round and high >= low
     return arc.over(low, low + arc.round if track.closed else high)
-
-
-def through_three(start, middle, end):
-    """The Arc through three points, origin at the middle one, or None where they are on a line."""
-    first, second = start - middle, end - middle
-    normal = cross(first, second)
-    double = normal @ normal
-    if double <= 1e-12 * (first @ first) * (second @ second):
-        return None
-    to_centre = cross((first @ first) * second - (second @ second) * first, normal) / (2 * double)
-    bend = to_centre / (to_centre @ to_centre)
-    tangent = _unit(cross(to_centre, normal))
-    if tangent @ (end - start) < 0:
-        tangent = -tangent
-    return Arc(middle, tangent, bend)
 
 
 def distances_to(shape, points):
