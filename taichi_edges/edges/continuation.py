@@ -10,10 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from taichi_edges.edges.arcs import fit_arc, through_three
 from taichi_edges.edges.model_selection import (
     Track,
     best_shape,
     distances_to,
+    misfit,
     observations,
     price_of,
     track_of,
@@ -26,6 +28,13 @@ JOINT_GAP_PX = 12.0  # between their ends, along; a tail or a gap at a touching 
 JOINT_ASIDE = 0.25  # of that gap: how far aside the other end may lie, beyond BESIDE
 LONGEST_RUN = 8  # strokes that may become one at once
 FOLLOWED = 0.5  # of the places of a stroke that the shape which replaces it runs along, at least
+CHORDS = 512  # of a shape, for its tangents
+COVERED = 0.5  # of a circle by strokes, at least
+GAP_SHOWN = 0.7  # of what lies between them, which the images must show as well
+GAP_SEEN, LEAST_GAP_VIEWS = (
+    0.25,
+    1.0,
+)  # a place is shown in this share of the views that see the strokes; in one at least
 REPEATED = 0.9  # of the places of a stroke beside others, from which on it says nothing new
 
 
@@ -38,14 +47,97 @@ class Merging:
     duplicates: int = 0
 
 
-def continued(shapes, yardstick, pixel):
+def continued(shapes, yardstick, pixel, seen):
     """The shapes after all three passes, and Merging.
 
-    shapes: list of shapes in the unit cube. yardstick: Yardstick. pixel: size of a pixel, unit-cube units.
+    shapes: list of shapes in the unit cube. yardstick: Yardstick. pixel: size of a pixel, unit-cube units. seen:
+    function of a shape and (n,) parameters that tells how many views see an edge there, (n,).
     """
-    chained = rejoined(shapes, yardstick, pixel)
+    rounded, circles = with_whole_circles(shapes, yardstick, pixel, seen)
+    chained = rejoined(rounded, yardstick, pixel)
     single = without_repeats(chained, yardstick, pixel)
-    return single, Merging(0, len(shapes) - len(chained), len(chained) - len(single))
+    joined = len(shapes) - len(rounded) + len(rounded) - len(chained)
+    return single, Merging(circles, joined, len(chained) - len(single))
+
+
+# --------------------------------------------------------------------------------------------------- whole circles
+
+
+def with_whole_circles(shapes, yardstick, pixel, seen):
+    """The shapes, arcs replaced by the circle they are parts of where that goes on; and how many circles that gave."""
+    shapes, circles = list(shapes), []
+    tracks = [track_of(shape, pixel) for shape in shapes]
+    waiting = sorted((n for n, shape in enumerate(shapes) if shape.kind == "arc"), key=lambda n: -shapes[n].length)
+    gone = set()
+    for number in waiting:
+        if number in gone:
+            continue
+        others = [n for n in range(len(shapes)) if n not in gone and not shapes[n].closed]
+        circle = circle_around(shapes[number], [tracks[n] for n in others], yardstick)
+        if circle is None:
+            continue
+        on = {n: on_shape(circle, tracks[n], yardstick) for n in others}
+        parts = [n for n in others if on[n].mean() >= REPEATED]
+        if number in parts and goes_on(circle, [tracks[n].points[on[n]] for n in others], pixel, seen):
+            if is_cheaper(circle, [shapes[n] for n in parts], [tracks[n] for n in parts], yardstick):
+                circles.append(circle)
+                gone.update(parts)
+    return [shape for n, shape in enumerate(shapes) if n not in gone] + circles, len(circles)
+
+
+def circle_around(shape, tracks, yardstick):
+    """The whole circle of an arc, fitted to all the places that lie on it; None where it runs away from the arc."""
+    middle = shape.low + 0.5 * (shape.high - shape.low)
+    points = np.concatenate([track.points for track in tracks])
+    share = np.concatenate([track.share for track in tracks])
+    circle = shape.over(middle - np.pi, middle + np.pi)
+    for width in (3.0, 2.0, 1.0, 1.0):
+        near = distances_to(circle, points) <= width * BESIDE * yardstick.noise
+        if near.sum() < 6:
+            return None
+        arc = through_three(*circle.at(np.array([0.25, 0.5, 0.75])))
+        tolerance = width * BESIDE * yardstick.noise
+        unused = np.broadcast_to(arc.tangent, points[near].shape)
+        arc = fit_arc(arc, points[near], unused, 0.0, tolerance, False, shares=share[near] / share.max())
+        if not 0.5 < arc.curvature * shape.radii[0] < 2.0:
+            return None
+        circle = arc.over(0.0, arc.round).shape()
+    return circle
+
+
+def goes_on(circle, places, pixel, seen):
+    """Do the strokes, and the images between them, show the whole circle? places: list of (n, 3) points on it."""
+    count = max(int(np.ceil(circle.length / pixel)), 8)
+    parameters = (np.arange(count) + 0.5) / count
+    distances = cKDTree(np.concatenate(places)).query(circle.at(parameters))[0]
+    covered = distances <= 1.5 * pixel
+    if covered.mean() < COVERED:
+        return False
+    if covered.all():
+        return True
+    views = seen(circle, parameters)
+    usual = np.median(views[covered])
+    return (views[~covered] >= max(GAP_SEEN * usual, LEAST_GAP_VIEWS)).mean() >= GAP_SHOWN
+
+
+def is_cheaper(shape, parts, tracks, yardstick):
+    """Does the shape describe what its parts describe at less cost (BIC)?"""
+    points, share = (np.concatenate([getattr(track, name) for track in tracks]) for name in ("points", "share"))
+    price = np.log(observations(share, yardstick))
+    before = price * sum(price_of(part) for part in parts)
+    return price * price_of(shape) + misfit(distances_to(shape, points), share, yardstick) < before
+
+
+def on_shape(shape, track, yardstick):
+    """(n,) bool: the places of a Track that lie on a shape and run along it."""
+    near = distances_to(shape, track.points) <= BESIDE * yardstick.noise
+    if near.any():
+        along = np.gradient(track.points, axis=0)
+        along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
+        parameters = np.linspace(0, 1, CHORDS)
+        nearest = cKDTree(shape.at(parameters)).query(track.points[near])[1]
+        near[near] = np.abs((shape.tangents(parameters)[nearest] * along[near]).sum(axis=1)) >= PARALLEL
+    return near
 
 
 # ---------------------------------------------------------------------------------------------------- smooth paths
@@ -176,18 +268,7 @@ def without_repeats(shapes, yardstick, pixel):
 
 def beside_others(track, shapes, yardstick):
     """(n,) bool: the places of a Track that lie on one of the shapes and run along it."""
-    along = np.gradient(track.points, axis=0)
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
-    found = np.zeros(len(track.points), bool)
-    for shape in shapes:
-        near = distances_to(shape, track.points) <= BESIDE * yardstick.noise
-        if near.any():
-            places = shape.at(np.linspace(0, 1, 512))
-            nearest = cKDTree(places).query(track.points[near])[1]
-            tangents = shape.tangents(np.linspace(0, 1, 512))[nearest]
-            near[near] = np.abs((tangents * along[near]).sum(axis=1)) >= PARALLEL
-        found |= near
-    return found
+    return np.any([on_shape(shape, track, yardstick) for shape in shapes], axis=0)
 
 
 def _unit(vector):

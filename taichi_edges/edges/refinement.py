@@ -1,8 +1,10 @@
 """From single edges to a wireframe: connected, minimal, in agreement with the images."""
 
 from dataclasses import dataclass
+from functools import partial
 
 from taichi_edges.edges.continuation import continued
+from taichi_edges.edges.evidence import support_along
 from taichi_edges.edges.junctions import connected
 from taichi_edges.edges.model_selection import Yardstick
 from taichi_edges.kernels.edgel_matching import EdgelMatching
@@ -15,6 +17,7 @@ STRETCH_PX = 4.0  # length of an edge on which the errors go together
 class RefineCounts:
     """What the refinement did."""
 
+    circles: int = 0
     joined: int = 0
     duplicates: int = 0
     unsupported: int = 0
@@ -29,6 +32,6 @@ def refine_wireframe(loose, views, config):
         return loose, RefineCounts()
     matching = EdgelMatching(views)
     yardstick = Yardstick(NOISE_PX * matching.pixel, STRETCH_PX * matching.pixel)
-    shapes, merging = continued(loose.shapes, yardstick, matching.pixel)
+    shapes, merging = continued(loose.shapes, yardstick, matching.pixel, partial(support_along, matching))
     wireframe = connected(shapes, matching.pixel)
-    return wireframe, RefineCounts(merging.joined, merging.duplicates)
+    return wireframe, RefineCounts(merging.circles, merging.joined, merging.duplicates)
