@@ -47,14 +47,15 @@ class Merging:
     duplicates: int = 0
 
 
-def continued(shapes, yardstick, pixel, seen):
+def continued(shapes, yardstick, pixel, seen, gap_px=JOINT_GAP_PX):
     """The shapes after all three passes, and Merging.
 
     shapes: list of shapes in the unit cube. yardstick: Yardstick. pixel: size of a pixel, unit-cube units. seen:
-    function of a shape and (n,) parameters that tells how many views see an edge there, (n,).
+    function of a shape and (n,) parameters that tells how many views see an edge there, (n,). gap_px: between strokes
+    that continue each other, at most.
     """
     rounded, circles = with_whole_circles(shapes, yardstick, pixel, seen)
-    chained = rejoined(rounded, yardstick, pixel)
+    chained = rejoined(rounded, yardstick, pixel, seen, gap_px)
     single = without_repeats(chained, yardstick, pixel)
     joined = len(shapes) - len(rounded) + len(rounded) - len(chained)
     return single, Merging(circles, joined, len(chained) - len(single))
@@ -78,7 +79,8 @@ def with_whole_circles(shapes, yardstick, pixel, seen):
             continue
         on = {n: on_shape(circle, tracks[n], yardstick) for n in others}
         parts = [n for n in others if on[n].mean() >= REPEATED]
-        if number in parts and goes_on(circle, [tracks[n].points[on[n]] for n in others], pixel, seen):
+        places = np.concatenate([tracks[n].points[on[n]] for n in others])
+        if number in parts and goes_on(circle, places, pixel, seen, COVERED):
             if is_cheaper(circle, [shapes[n] for n in parts], [tracks[n] for n in parts], yardstick):
                 circles.append(circle)
                 gone.update(parts)
@@ -105,17 +107,17 @@ def circle_around(shape, tracks, yardstick):
     return circle
 
 
-def goes_on(circle, places, pixel, seen):
-    """Do the strokes, and the images between them, show the whole circle? places: list of (n, 3) points on it."""
-    count = max(int(np.ceil(circle.length / pixel)), 8)
+def goes_on(shape, places, pixel, seen, least=0.0):
+    """Do strokes, and the images between them, show the whole shape? places: (n, 3) points of strokes on it.
+
+    least: share of the shape that the strokes must cover.
+    """
+    count = max(int(np.ceil(shape.length / pixel)), 8)
     parameters = (np.arange(count) + 0.5) / count
-    distances = cKDTree(np.concatenate(places)).query(circle.at(parameters))[0]
-    covered = distances <= 1.5 * pixel
-    if covered.mean() < COVERED:
-        return False
-    if covered.all():
-        return True
-    views = seen(circle, parameters)
+    covered = cKDTree(places).query(shape.at(parameters))[0] <= 1.5 * pixel
+    if covered.all() or covered.mean() < least:
+        return bool(covered.all())
+    views = seen(shape, parameters)
     usual = np.median(views[covered])
     return (views[~covered] >= max(GAP_SEEN * usual, LEAST_GAP_VIEWS)).mean() >= GAP_SHOWN
 
@@ -143,15 +145,15 @@ def on_shape(shape, track, yardstick):
 # ---------------------------------------------------------------------------------------------------- smooth paths
 
 
-def rejoined(shapes, yardstick, pixel):
+def rejoined(shapes, yardstick, pixel, seen, gap_px=JOINT_GAP_PX):
     """The shapes, each path of strokes that continue each other cut anew into as few as pay."""
-    paths = smooth_paths(shapes, yardstick, pixel)
-    return [shape for path in paths for shape in cut_anew(shapes, path, yardstick, pixel)]
+    paths = smooth_paths(shapes, yardstick, pixel, gap_px)
+    return [shape for path in paths for shape in cut_anew(shapes, path, yardstick, pixel, seen)]
 
 
-def smooth_paths(shapes, yardstick, pixel):
+def smooth_paths(shapes, yardstick, pixel, gap_px):
     """Lists of (index, reversed) of strokes that continue each other; every shape is in one of them."""
-    partner = joints(shapes, yardstick, pixel)
+    partner = joints(shapes, yardstick, pixel, gap_px)
     paths, seen = [], set()
     ends = [(number, side) for number, shape in enumerate(shapes) for side in (0, 1)]
     starts = [end for end in ends if end not in partner] + ends  # open paths first, then what goes round
@@ -170,7 +172,7 @@ def smooth_paths(shapes, yardstick, pixel):
     return paths
 
 
-def joints(shapes, yardstick, pixel):
+def joints(shapes, yardstick, pixel, gap_px):
     """{(shape, side): (shape, side)} of ends that continue each other, each the best for the other."""
     ends = [(number, side) for number, shape in enumerate(shapes) if not shape.closed for side in (0, 1)]
     if len(ends) < 2:
@@ -178,7 +180,7 @@ def joints(shapes, yardstick, pixel):
     places = np.array([shapes[number].ends[side] for number, side in ends])
     outward = np.array([(2 * side - 1) * shapes[number].tangents(float(side)) for number, side in ends])
     found = []
-    for i, j in sorted(cKDTree(places).query_pairs(JOINT_GAP_PX * pixel)):
+    for i, j in sorted(cKDTree(places).query_pairs(gap_px * pixel)):
         if ends[i][0] == ends[j][0] or outward[i] @ outward[j] > -JOINT_COSINE:
             continue
         step = places[j] - places[i]
@@ -194,7 +196,7 @@ def joints(shapes, yardstick, pixel):
     return partner
 
 
-def cut_anew(shapes, path, yardstick, pixel):
+def cut_anew(shapes, path, yardstick, pixel, seen):
     """The shapes that describe a path with the least cost (BIC), each over a run of its strokes."""
     if len(path) == 1:
         return [shapes[path[0][0]]]
@@ -211,7 +213,8 @@ def cut_anew(shapes, path, yardstick, pixel):
                 run = tracks[first : last + 1]
                 shape, cost = best_shape(joined_track(run), yardstick, count)
                 if shape is not None and all(follows(shape, track, yardstick) for track in run):
-                    options.append((least[first] + cost, first, shape))
+                    if goes_on(shape, np.concatenate([track.points for track in run]), pixel, seen):
+                        options.append((least[first] + cost, first, shape))
         cost, first, shape = min(options, key=lambda option: option[0])
         least.append(cost)
         choice.append((first, shape))

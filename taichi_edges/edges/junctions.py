@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from taichi_edges.edges.arcs import through_three
-from taichi_edges.edges.fitting import fit_chain
+from taichi_edges.edges.fitting import fit_chain, lsq_chain, nearest_on_chain
 from taichi_edges.edges.model_selection import distances_to, track_of
 from taichi_edges.edges.ordering import Ordering
 from taichi_edges.shapes import EllipticArc, Line, Spline
@@ -24,6 +24,7 @@ MEETING_PX = 1.0  # edges that meet come as near as that
 SHARE = 0.4  # of an edge's length: its ends do not move inwards by more
 TANGENTIAL = np.cos(np.radians(18.0))  # edges that meet at a smaller angle run into each other
 LEVER_PX = 4.0  # how far apart in space two tangents count that differ by a radian
+END_WEIGHT = 1e3  # of the ends of a chain against the points between them
 FRUGAL = 0.05  # weight of the way of an end against the distance that it leaves
 
 
@@ -254,7 +255,18 @@ def spline_between(shape, ends, pixel):
     points = np.concatenate([ends[:1], track.points[inside], ends[1:]])
     ordering = Ordering(arc - arc[0], float(arc[-1] - arc[0]), False)
     curves, _ = fit_chain(points, ordering, pixel, len(shape.curves))
-    for at, place, inner, end in ((0, 0, 1, ends[0]), (-1, 3, 2, ends[1])):
-        curves[at, inner] += end - curves[at, place]
-        curves[at, place] = end
-    return Spline(curves)
+    return Spline(chain_between(points, curves))
+
+
+def chain_between(points, curves):
+    """A chain of cubics fitted once more to the points, so that it starts and ends in the first and the last of them.
+
+    points: (n, 3) in order. curves: (c, 4, 3) near them. A heavy weight moves the ends, the rest of the way is nothing.
+    """
+    parameters = nearest_on_chain(points, curves)[1]
+    parameters[0], parameters[-1] = 0.0, len(curves)
+    weights = np.ones(len(points))
+    weights[[0, -1]] = END_WEIGHT
+    curves = lsq_chain(parameters, points, weights, len(curves))
+    curves[0, 0], curves[-1, 3] = points[0], points[-1]
+    return curves
