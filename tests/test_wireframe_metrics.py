@@ -268,6 +268,20 @@ def curves_of(edges):
     return EdgeSet(np.zeros((0, 2, 3)), np.concatenate(edges), np.zeros(0, int), sources)
 
 
+def test_order_and_sense_of_the_edges_do_not_matter(generator, tmp_path):
+    """Edges of a part, some shortened, some joined; the same ones in another order, run through backwards."""
+    part = PARTS["bracket"]().edges
+    truth = edge_file_truth(tmp_path, part)
+    lines = np.array([lengthened(segment, *generator.choice([-7, -3, 0, 0, 3], 2)) for segment in part.lines])
+    one, other = generator.permutation(len(lines)), generator.permutation(len(part.curves))
+    turned = EdgeSet(lines[one, ::-1], part.curves[other, ::-1], part.line_sources[one], part.curve_sources[other])
+    first = evaluate(EdgeSet(lines, part.curves, part.line_sources, part.curve_sources), truth)
+    second = evaluate(turned, truth)
+    keys = [key for key in first if "corner" in key or "joint" in key or "free" in key or key.startswith("exact")]
+    assert len(keys) == 19
+    assert [second[key] for key in keys] == pytest.approx([first[key] for key in keys], abs=1e-3)
+
+
 # ---------------------------------------------------------------------------------------------------------- circles
 
 
