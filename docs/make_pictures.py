@@ -13,10 +13,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from taichi_edges.edge_set import read_edges
 from taichi_edges.exporters.overlays import background, draw_edges
 from taichi_edges.exporters.palette import label_colours
 from taichi_edges.views import read_views
+from taichi_edges.wireframe import read_wireframe
 
 PANEL = 420  # px
 MARGIN = 0.08  # of the panel, around the edges
@@ -45,7 +45,8 @@ def main(folder, view_name, out):
     folder = Path(folder)
     views = read_views(folder / "views.npz")
     view = views.names.index(view_name)
-    edges = read_edges(folder / "edges.json")[0].transformed(views.similarity.to_unit)
+    wireframe, _ = read_wireframe(folder / "edges.json")
+    wireframe = wireframe.transformed(views.similarity.to_unit, views.similarity.scale)
     with np.load(folder / "clusters.npz") as clusters:
         points, labels = clusters["points"], clusters["labels"]
     shape = (views.height, views.width)
@@ -56,8 +57,8 @@ def main(folder, view_name, out):
         canvas = background(replace(views, image_paths=(str(own_picture),) * len(views)), view)
     else:
         canvas = np.full((*shape, 3), 255, np.uint8)
-    drawn = draw_edges(canvas, views.intrinsics[view] @ views.world_to_camera[view], edges)
-    left, top, side = crop_of(views.project(edges.sample(0.01)[0], view)[0], (views.width, views.height))
+    drawn = draw_edges(canvas, views.intrinsics[view] @ views.world_to_camera[view], wireframe)
+    left, top, side = crop_of(views.project(wireframe.edge_set().sample(0.01)[0], view)[0], (views.width, views.height))
     panels = [image[top : top + side, left : left + side] for image in (edge_map, dots, drawn)]
     panels = panels if own_picture.exists() else panels[1:]
     cv2.imwrite(out, np.hstack([cv2.resize(panel, (PANEL, PANEL), interpolation=cv2.INTER_AREA) for panel in panels]))

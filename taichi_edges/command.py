@@ -99,13 +99,13 @@ def _print_table(title, headings, rows):
 
 def show(run):
     """An Open3D window of the oriented points and the edges."""
-    from taichi_edges.edge_set import read_edges
     from taichi_edges.exporters.point_cloud import read_oriented_points
     from taichi_edges.exporters.viewer import show as show_window
+    from taichi_edges.wireframe import read_wireframe
 
     for artefact in ("points.ply", "edges.json"):
         if not run.path(artefact).exists():
             raise UserError(f"{run.path(artefact)}: not there yet; --show needs the refine stage, run without --until")
     points, directions = read_oriented_points(run.path("points.ply"))
     files = [str(run.path(name)) for name in ("points.ply", "edges.ply", "edges.obj", "overlays.png")]
-    show_window(points, directions, read_edges(run.path("edges.json"))[0], files)
+    show_window(points, directions, read_wireframe(run.path("edges.json"))[0], files)

@@ -359,23 +359,24 @@ def evaluate(run):
 
 
 def export(run):
-    """`edges.json` and `views.npz` -> `edges.ply`, `edges.obj`, pictures in `overlays/` and `overlays.png`."""
+    """`edges.json`, `views.npz` -> `edges.ply`, `.obj`, `.dxf`, `.step`, pictures in `overlays/`, `overlays.png`."""
     from taichi_edges.exporters import EXPORTERS
     from taichi_edges.exporters.overlays import contact_sheet, draw_overlays
 
-    edges, _ = read_edges(run.path("edges.json"))
+    wireframe, _ = read_wireframe(run.path("edges.json"))
     views = with_whole_paths(run, read_views(run.path("views.npz")))
     written = []
     for suffix, write in EXPORTERS.items():
         path = run.path(f"edges{suffix}")
-        if len(edges):
-            write(path, edges)
+        if len(wireframe):
+            write(path, wireframe)
             written.append(path.name)
         else:
             path.unlink(missing_ok=True)  # an older run's edges must not pass for this one's
     for stale in run.path("overlays").glob("*.png"):
         stale.unlink()
-    pictures = draw_overlays(run.path("overlays"), views, edges.transformed(views.similarity.to_unit))
+    unit = wireframe.transformed(views.similarity.to_unit, views.similarity.scale)
+    pictures = draw_overlays(run.path("overlays"), views, unit)
     contact_sheet(pictures, run.path("overlays.png"))
     return {"files": [*written, "overlays.png", *(f"overlays/{path.name}" for path in pictures)]}
 

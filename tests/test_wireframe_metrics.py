@@ -244,6 +244,44 @@ def test_a_line_that_touches_a_circle_has_a_tangential_joint_there(tmp_path):
     assert evaluate(circle_alone, truth)["tangential_joints_reached_percent"] == 0.0
 
 
+def touching_parabola():
+    """A parabola that touches the circle of radius 0.2 in the plane across; its apex is at (0.7, 0.5, 0.5)."""
+    return np.array([[0.7, 0.3, 0.4], [0.7, 1.3 / 3, 1.6 / 3], [0.7, 1.7 / 3, 1.6 / 3], [0.7, 0.7, 0.4]])
+
+
+@pytest.mark.parametrize(("above_mm", "closed"), [(0.0, 1), (0.1, 1), (1.0, 0)])
+def test_two_curves_that_touch_need_no_end_where_they_do(tmp_path, above_mm, closed):
+    """The file cuts the parabola at its apex; one edge all along it is as good if it touches the circle."""
+    halves, circle = np.stack(split_cubic(touching_parabola())), circle_pieces(4)
+    truth = edge_file_truth(tmp_path, curves_of([halves[:1], halves[1:], circle]))
+    assert evaluate(curves_of([halves[:1], halves[1:], circle]), truth)["tangential_joints_closed"] == 1
+    whole = touching_parabola() + [0, 0, above_mm / 1000]
+    metrics = evaluate(curves_of([whole[None], circle]), truth)
+    assert (metrics["true_edges"], metrics["tangential_joints"]) == (3, 1)
+    assert metrics["tangential_joints_closed"] == closed
+    assert metrics["tangential_joints_reached_percent"] == 100.0
+
+
+def curves_of(edges):
+    """List of (k, 4, 3) cubics, each the pieces of one edge -> EdgeSet."""
+    sources = np.repeat(np.arange(len(edges)), [len(pieces) for pieces in edges])
+    return EdgeSet(np.zeros((0, 2, 3)), np.concatenate(edges), np.zeros(0, int), sources)
+
+
+def test_order_and_sense_of_the_edges_do_not_matter(generator, tmp_path):
+    """Edges of a part, some shortened, some joined; the same ones in another order, run through backwards."""
+    part = PARTS["bracket"]().edges
+    truth = edge_file_truth(tmp_path, part)
+    lines = np.array([lengthened(segment, *generator.choice([-7, -3, 0, 0, 3], 2)) for segment in part.lines])
+    one, other = generator.permutation(len(lines)), generator.permutation(len(part.curves))
+    turned = EdgeSet(lines[one, ::-1], part.curves[other, ::-1], part.line_sources[one], part.curve_sources[other])
+    first = evaluate(EdgeSet(lines, part.curves, part.line_sources, part.curve_sources), truth)
+    second = evaluate(turned, truth)
+    keys = [key for key in first if "corner" in key or "joint" in key or "free" in key or key.startswith("exact")]
+    assert len(keys) == 19
+    assert [second[key] for key in keys] == pytest.approx([first[key] for key in keys], abs=1e-3)
+
+
 # ---------------------------------------------------------------------------------------------------------- circles
 
 

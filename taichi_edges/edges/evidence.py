@@ -94,14 +94,13 @@ class Claims:
     @staticmethod
     def of(count, edgels, edges, distances):
         """From pairs of edgel and edge: edgels, edges, distances (p,). count: of edgels. Of ties the first wins."""
-        order = np.lexsort((edges, distances, edgels))
-        edgels, edges, distances = edgels[order], edges[order], distances[order]
-        owners, nearest, rivals = np.full(count, -1), np.full(count, np.inf), np.full(count, np.inf)
-        claimed, first = np.unique(edgels, return_index=True)
-        owners[claimed], nearest[claimed] = edges[first], distances[first]
+        owners, nearest, rivals = np.full(count, np.iinfo(np.int64).max), np.full(count, np.inf), np.full(count, np.inf)
+        np.minimum.at(nearest, edgels, distances)
+        first = distances == nearest[edgels]
+        np.minimum.at(owners, edgels[first], edges[first])
+        owners[np.isinf(nearest)] = -1
         others = edges != owners[edgels]
-        contested, first = np.unique(edgels[others], return_index=True)
-        rivals[contested] = distances[others][first]
+        np.minimum.at(rivals, edgels[others], distances[others])
         return Claims(owners, nearest, rivals)
 
     def beside(self, edge):
@@ -157,14 +156,14 @@ class Support:
         return np.sqrt(self.samples.sums(squares) / np.maximum(self.samples.sums(found), 1))
 
 
-def support_of(matching, shapes):
-    """The Support of shapes. matching: EdgelMatching.
+def support_of(matching, shapes, radius=MATCH_PX, spacing=SPACING_PX):
+    """The Support of shapes. matching: EdgelMatching. radius, spacing: px, of matches and of the samples.
 
     The noise can make an edgel nearer to the wrong one of two edges, so an edge with fewer views on its length than the
     best one counts as farther away, by up to TIE_NOISES times the noise.
     """
-    samples = Samples.along(shapes, SPACING_PX * matching.pixel)
-    edgels, residuals = _matches(matching, samples.points, samples.directions)
+    samples = Samples.along(shapes, spacing * matching.pixel)
+    edgels, residuals = _matches(matching, samples.points, samples.directions, radius)
     nearest = _owned(matching, samples, edgels, residuals, np.zeros(len(shapes)))
     strengths = samples.sums(nearest.views) / np.maximum(np.diff(samples.starts), 1)
     handicaps = TIE_NOISES * nearest.noise_px * (1.0 - strengths / max(strengths.max(initial=0.0), 1e-300))
@@ -211,7 +210,7 @@ def support_along(matching, shape, parameters, claims=None, own=-1):
     parameters: (n,) of the places. claims: Claims of all edges, whose edgels do not count unless they are this shape's
     or farther from all others than from it. own: the index of this shape among those, if it is one of them.
     """
-    edgels, residuals = _matches(matching, shape.at(parameters), shape.tangents(parameters))
+    edgels, residuals = _matches(matching, shape.at(parameters), shape.tangents(parameters), MATCH_PX)
     if claims is not None:
         others = np.append(claims.beside(own), np.inf)[edgels]
         edgels = np.where(np.abs(residuals) + TIE_PX < others, edgels, -1)
@@ -234,10 +233,10 @@ def chance_weight(matching):
     return total
 
 
-def _matches(matching, points, directions):
-    """(n, V) edgels, -1 where there is none within MATCH_PX, and residuals of places in all views."""
+def _matches(matching, points, directions, radius):
+    """(n, V) edgels, -1 where there is none within so many px, and residuals of places in all views."""
     count = matching.edgels.view_count
-    edgels, residuals, _ = matching.matches(points, directions, slice(0, count), MATCH_PX)
+    edgels, residuals, _ = matching.matches(points, directions, slice(0, count), radius)
     return edgels, residuals
 
 

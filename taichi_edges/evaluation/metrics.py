@@ -19,7 +19,8 @@ from taichi_edges.errors import UserError
 from taichi_edges.evaluation.dense_curves import STEP
 from taichi_edges.evaluation.duplicates import duplicated_percent
 from taichi_edges.evaluation.primitives import true_primitives
-from taichi_edges.evaluation.wireframe_metrics import wireframe, wireframe_metrics
+from taichi_edges.evaluation.wireframe import wireframe
+from taichi_edges.evaluation.wireframe_metrics import wireframe_metrics
 
 SAMPLE_SPACING = 0.005  # normalised units, EMAP sample_resolution
 VOXELS_PER_UNIT = 128  # EMAP: 256 voxels over [-1, 1] on each axis

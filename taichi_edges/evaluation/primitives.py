@@ -5,7 +5,7 @@ A full circle comes as two or six arcs, a straight side as two lines where a fac
 * pieces of one circle that touch end to end;
 * smooth pieces that together are one closed ellipse.
 All else stays as the file says: a spline that the file splits is two edges, for nothing tells where it should be cut.
-A polyline of the file has vertices on its curve, up to 15 mm apart, so its chords miss the curve by up to 0.1 mm. A
+A polyline of the file has vertices on its curve, up to 17 mm apart, so its chords miss the curve by up to 0.1 mm. A
 cubic spline through the vertices misses a circle of radius r with one every h by 0.013 h^4 / r^3: 0.1 micrometres.
 """
 
@@ -16,7 +16,7 @@ from taichi_edges.evaluation.dense_curves import STEP
 # Points at most this far apart, in normalised units, are one vertex. Joined edges share it exactly, but an edge that
 # ends on an arc is off the cubics which the arc is written as: by 2.7e-4 of its radius, 0.14 mm at a radius of 0.5.
 JOINED = 0.0002
-CORNER_DEGREES = 20.0  # edges that meet at less continue or touch each other
+CORNER_DEGREES = 20.0  # edges at less continue or touch each other: 5 mm on they are 1.7 mm apart, half a pixel or so
 SHAPE_TOLERANCE = 3e-4  # of the radius, or the length if less: a cubic of 90 degrees misses its circle by 2.7e-4
 CHORD_ERROR = 1e-5  # normalised units: polylines that miss their curve by less stay as they are
 

@@ -2,76 +2,94 @@
 
 import numpy as np
 
-from taichi_edges.artefacts import replacing, write_text
-from taichi_edges.errors import UserError
+from taichi_edges.artefacts import write_text
+from taichi_edges.exporters.naming import confidence_of, edge_name, evidence_words, refuse_empty
 from taichi_edges.exporters.palette import label_colours
+from taichi_edges.exporters.ply import write_elements
+from taichi_edges.shapes import polyline
 
-CURVE_SEGMENTS = 32  # a quarter circle in so many chords is off by 0.03 % of its radius
+CURVE_SEGMENTS = 32  # for each cubic: a quarter circle in so many chords is off by 0.03 % of its radius
 
 
-def line_set_arrays(edges):
-    """The polylines of an EdgeSet as one indexed line set.
+def edge_paths(wireframe):
+    """The edges of a Wireframe as paths over one list of points.
 
-    Returns vertices (n, 3) float64, segments (m, 2) int32 into the vertices, and (m,) the edge of each segment,
-    lines first. Edges share no vertices: two edges that meet have one each.
+    Returns points (n, 3) float64, the wireframe's vertices first, and for each edge the (k,) int64 indices of the
+    points along it: edges that meet share the index of their vertex, a closed edge ends with the index it starts with.
     """
-    polylines = edges.polylines(CURVE_SEGMENTS)
-    vertices = np.concatenate([np.zeros((0, 3)), *polylines])
-    sizes = np.array([len(polyline) for polyline in polylines], dtype=np.int64)
-    owners = np.repeat(np.arange(len(polylines)), sizes)
-    starts = np.flatnonzero(owners[:-1] == owners[1:])  # a vertex whose successor is of the same edge
-    segments = np.stack([starts, starts + 1], axis=1).astype(np.int32)
-    return vertices, segments, owners[starts]
+    points, paths, count = [wireframe.vertices], [], len(wireframe.vertices)
+    for edge in wireframe.edges:
+        along = polyline(edge.shape, CURVE_SEGMENTS)
+        own = along[:-1] if edge.shape.closed else along[1:-1]
+        between = count + np.arange(len(own))
+        first, last = (between[:0], between[:1]) if edge.shape.closed else np.reshape(edge.vertices, (2, 1))
+        paths.append(np.concatenate([first, between, last]))
+        points.append(own)
+        count += len(own)
+    return np.concatenate(points), paths
 
 
-def edge_colours(edges):
-    """(L + C, 3) uint8 RGB, lines first: the colour of the cluster each edge came from, grey where it is unknown."""
-    return label_colours(np.concatenate([edges.line_sources, edges.curve_sources]))
+def line_set_arrays(wireframe):
+    """The edges of a Wireframe as one indexed line set.
+
+    Returns points (n, 3) float64, segments (m, 2) int32 into them, and (m,) the edge of each segment.
+    """
+    points, paths = edge_paths(wireframe)
+    segments = [np.stack([path[:-1], path[1:]], axis=1) for path in paths]
+    owners = np.repeat(np.arange(len(paths)), [len(pairs) for pairs in segments])
+    return points, np.concatenate([np.zeros((0, 2)), *segments]).astype(np.int32), owners
 
 
-def build_line_set(edges):
-    """An EdgeSet as an open3d.geometry.LineSet, one colour per edge."""
+def build_line_set(wireframe):
+    """A Wireframe as an open3d.geometry.LineSet, one colour per edge."""
     import open3d as o3d
 
-    vertices, segments, owners = line_set_arrays(edges)
-    line_set = o3d.geometry.LineSet(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector2iVector(segments))
-    line_set.colors = o3d.utility.Vector3dVector(edge_colours(edges)[owners] / 255.0)
+    points, segments, owners = line_set_arrays(wireframe)
+    line_set = o3d.geometry.LineSet(o3d.utility.Vector3dVector(points), o3d.utility.Vector2iVector(segments))
+    line_set.colors = o3d.utility.Vector3dVector(label_colours(owners) / 255.0)
     return line_set
 
 
-def write_line_set_ply(path, edges):
-    """Write a binary PLY: vertices as doubles, edges as vertex1, vertex2, red, green, blue; curves as polylines.
+def write_line_set_ply(path, wireframe):
+    """Write a binary PLY: points as doubles, segments as vertex1, vertex2, red, green, blue and two of our own.
 
-    edges: EdgeSet in the frame the file shall have.
+    These are `edge`, the index in `edges.json`, and `confidence`, NaN where it is unknown; readers skip properties
+    that they do not know. wireframe: in the frame the file shall have.
     """
-    import open3d as o3d
+    refuse_empty(path, wireframe)
+    points, pairs, owners = line_set_arrays(wireframe)
+    vertices = np.zeros(len(points), [(axis, "<f8") for axis in "xyz"])
+    vertices["x"], vertices["y"], vertices["z"] = points.T
+    fields = [("vertex1", "<i4"), ("vertex2", "<i4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
+    segments = np.zeros(len(pairs), [*fields, ("confidence", "<f4"), ("edge", "<i4")])
+    segments["vertex1"], segments["vertex2"] = pairs.T
+    segments["red"], segments["green"], segments["blue"] = label_colours(owners).T
+    segments["confidence"] = np.array([confidence_of(edge) for edge in wireframe.edges])[owners]
+    segments["edge"] = owners
+    return write_elements(path, {"vertex": vertices, "edge": segments})
 
-    _refuse_empty(path, edges)
-    with replacing(path) as unfinished:
-        if not o3d.io.write_line_set(str(unfinished), build_line_set(edges)):
-            raise UserError(f"{path}: Open3D could not write it; is the disk full?")
-    return path
 
+def write_line_set_obj(path, wireframe):
+    """Write a Wavefront OBJ: one object `line_3` or `arc_0` with one `l` polyline per edge, numbers in full.
 
-def write_line_set_obj(path, edges):
-    """Write a Wavefront OBJ: one object `line_3` or `curve_0` with one `l` polyline per edge, numbers in full.
-
-    edges: EdgeSet in the frame the file shall have.
+    wireframe: in the frame the file shall have.
     """
-    _refuse_empty(path, edges)
-    names = [f"line_{index}" for index in range(len(edges.lines))]
-    names += [f"curve_{index}" for index in range(len(edges.curves))]
-    text, first = ["# taichi_edges: parametric edges as polylines"], 1  # OBJ counts vertices from 1
-    for name, polyline in zip(names, edges.polylines(CURVE_SEGMENTS), strict=True):
-        text.append(f"o {name}")
-        text += ["v " + " ".join(repr(x) for x in vertex) for vertex in polyline.tolist()]
-        text.append("l " + " ".join(str(first + offset) for offset in range(len(polyline))))
-        first += len(polyline)
+    refuse_empty(path, wireframe)
+    points, paths = edge_paths(wireframe)
+    text = ["# taichi_edges: edges as polylines; those that meet share vertices"]
+    text += _vertex_lines(wireframe.vertices)
+    written = len(wireframe.vertices)
+    for number, (edge, along) in enumerate(zip(wireframe.edges, paths, strict=True)):
+        text.append(f"o {edge_name(number, edge)}")
+        text += [f"# {evidence_words(edge)}"] if edge.evidence else []
+        upto = max(written, along.max() + 1)
+        text += _vertex_lines(points[written:upto])
+        text.append("l " + " ".join(map(str, along + 1)))  # OBJ counts vertices from 1
+        written = upto
     write_text(path, "\n".join(text) + "\n")
     return path
 
 
-def _refuse_empty(path, edges):
-    """Neither Open3D nor the programs that open these files take one without a single edge."""
-    if len(edges) == 0:
-        raise UserError(f"{path}: there are no edges to write; look at the clusters and loosen the fit's thresholds")
+def _vertex_lines(points):
+    """'v 0.1 0.2 0.3' of each of the (n, 3) points."""
+    return ["v " + " ".join(map(repr, point)) for point in points.tolist()]

@@ -11,13 +11,18 @@ from taichi_edges.cameras import NEAR
 from taichi_edges.detectors.pictures import read_colour
 from taichi_edges.errors import UserError
 from taichi_edges.exporters.line_sets import line_set_arrays
+from taichi_edges.exporters.naming import confidence_of
 from taichi_edges.exporters.palette import CURVE_COLOUR, LINE_COLOUR
 
 OVERSAMPLING = 4  # the edges are drawn so many times larger and averaged
 SUBPIXEL_BITS = 4  # OpenCV draws in units of 1/16 pixel
 LINE_WIDTH = 2.5  # pixels at REFERENCE_WIDTH
-DOT_WIDTH = 2.2  # diameter of an end point, in line widths
+FAINTEST = 0.3  # how opaque an edge of confidence 0 is drawn
+DOT_WIDTH = 2.2  # diameter of a vertex, in line widths
 DOT_COLOUR = (30, 30, 30)
+RING_WIDTH, RING_STROKE = 2.8, 0.5  # a free end: diameter of the ring, and what it is drawn with, in line widths
+RING_COLOUR = (255, 255, 255)  # inside
+RING_SIDES = 16
 FADED_TO = 0.35  # how dark an edge pixel of the map is drawn, 1 = black
 IMAGE_FADE = 0.35  # how far the colour image is mixed with white, so that the edges stand out
 REFERENCE_WIDTH = 800  # pixels; strokes and letters grow with wider images
@@ -28,20 +33,20 @@ GREYS = np.arange(256)
 SAME_SHAPE = 0.01  # an image whose aspect is off by more is not a picture of this view
 
 
-def draw_overlays(folder, views, edges_unit, count=4):
-    """Draw the edges over `count` views that look in different directions, one PNG each.
+def draw_overlays(folder, views, wireframe, count=4):
+    """Draw the edges of a wireframe over `count` views that look in different directions, one PNG each.
 
     Over the view's colour image where there is a readable one, else over its edge map, faded. Hidden edges are drawn
     too. The picture is the view, pixel for pixel, with a caption below it.
 
-    folder: where the files go. views: Views. edges_unit: EdgeSet in the unit cube. Returns the paths, by view.
+    folder: where the files go. views: Views. wireframe: Wireframe in the unit cube. Returns the paths, by view.
     """
     paths = []
     for view in choose_views(views, count):
-        picture = draw_edges(background(views, view), views.intrinsics[view] @ views.world_to_camera[view], edges_unit)
+        picture = draw_edges(background(views, view), views.intrinsics[view] @ views.world_to_camera[view], wireframe)
         safe_name = re.sub(r"[^\w.-]+", "_", views.names[view])
         paths.append(Path(folder) / f"overlay_{view:04d}_{safe_name}.png")
-        _write_png(paths[-1], np.concatenate([picture, caption(views.width, views.names[view], edges_unit)]))
+        _write_png(paths[-1], np.concatenate([picture, caption(views.width, views.names[view], wireframe)]))
     return paths
 
 
@@ -94,23 +99,55 @@ def background(views, view):
     return np.repeat(faded[:, :, None], 3, axis=2)
 
 
-def draw_edges(picture, projection, edges):
-    """Draw anti-aliased edges and their end points on a (H, W, 3) uint8 BGR picture, in place; returns it.
+def draw_edges(picture, projection, wireframe):
+    """Draw anti-aliased edges and their vertices on a (H, W, 3) uint8 BGR picture, in place; returns it.
 
-    projection: (3, 4) intrinsics @ world_to_camera. edges: EdgeSet in the world of the projection.
+    The less confidence in an edge, the fainter it is. A vertex where edges meet is a dark dot, a free end an open ring.
+    projection: (3, 4) intrinsics @ world_to_camera. wireframe: in the world of the projection.
     """
     height, width = picture.shape[:2]
     stroke = LINE_WIDTH * max(width / REFERENCE_WIDTH, 0.5)
-    vertices, segments, owners = line_set_arrays(edges)
-    homogeneous = vertices @ projection[:, :3].T + projection[:, 3]
+    points, segments, owners = line_set_arrays(wireframe)
+    homogeneous = points @ projection[:, :3].T + projection[:, 3]
     planes = frustum_planes(width, height, margin=2 * stroke)
-    for is_curve, colour in ((False, LINE_COLOUR), (True, CURVE_COLOUR)):
-        of_kind = segments[(owners >= len(edges.lines)) == is_curve]
-        _paint(picture, colour, clip_segments(homogeneous[of_kind], planes), stroke)
-    ends = homogeneous[_end_vertices(segments, owners)]
-    visible = (ends[:, 2] >= NEAR) & (ends @ planes.T >= 0).all(axis=1)
-    _paint(picture, DOT_COLOUR, np.repeat(ends[visible, None], 2, axis=1), DOT_WIDTH * stroke)
+    opacities, straight = _opacities(wireframe), _are_lines(wireframe)
+    for is_line, colour in ((True, LINE_COLOUR), (False, CURVE_COLOUR)):
+        levels = np.unique(opacities[straight == is_line])  # rising, so that the surer edge is on top
+        of_level = [segments[((straight == is_line) & (opacities == level))[owners]] for level in levels]
+        clipped = [_pixels(clip_segments(homogeneous[each], planes)) for each in of_level]
+        _paint(picture, colour, stroke, list(zip(levels, clipped, strict=True)))
+    vertices, degrees = homogeneous[: len(wireframe.vertices)], wireframe.degrees
+    visible = (vertices[:, 2] >= NEAR) & (vertices @ planes.T >= 0).all(axis=1)
+    for ring, which in ((False, degrees > 1), (True, degrees == 1)):
+        _mark(picture, _pixels(vertices[visible & which]), stroke, ring)
     return picture
+
+
+def _pixels(homogeneous):
+    """(..., 3) homogeneous pixels, all in front of the camera -> (..., 2)."""
+    return homogeneous[..., :2] / homogeneous[..., 2:]
+
+
+def _opacities(wireframe):
+    """(n,) FAINTEST to 1, by confidence, in steps of 0.05; an edge that nobody has judged is opaque."""
+    confidences = np.nan_to_num(np.array([confidence_of(edge) for edge in wireframe.edges], dtype=float), nan=1.0)
+    return np.round(20 * (FAINTEST + (1 - FAINTEST) * np.clip(confidences, 0, 1))) / 20
+
+
+def _are_lines(wireframe):
+    """(n,) bool."""
+    return np.array([shape.kind == "line" for shape in wireframe.shapes], dtype=bool)
+
+
+def _mark(picture, pixels, stroke, ring):
+    """Draw vertices at the (n, 2) pixels: dots, or white discs with a dark outline."""
+    if not ring:
+        return _paint(picture, DOT_COLOUR, DOT_WIDTH * stroke, [(1.0, np.repeat(pixels[:, None], 2, axis=1))])
+    _paint(picture, RING_COLOUR, RING_WIDTH * stroke, [(1.0, np.repeat(pixels[:, None], 2, axis=1))])
+    round_trip = np.linspace(0, 2 * np.pi, RING_SIDES + 1)
+    outline = 0.5 * RING_WIDTH * stroke * np.stack([np.cos(round_trip), np.sin(round_trip)], axis=1)
+    sides = np.stack([outline[:-1], outline[1:]], axis=1)
+    return _paint(picture, DOT_COLOUR, RING_STROKE * stroke, [(1.0, (pixels[:, None, None] + sides).reshape(-1, 2, 2))])
 
 
 def frustum_planes(width, height, margin):
@@ -139,23 +176,44 @@ def clip_segments(segments, planes):
     return segments[kept, :1] * (1.0 - at) + segments[kept, 1:] * at
 
 
-def caption(width, name, edges):
-    """The strip below the picture, (h, width, 3) uint8 BGR: the view's name on the left, the legend on the right."""
+def caption(width, name, wireframe):
+    """The strip below the picture, (h, width, 3) uint8 BGR: the view's name on the left, the legend on the right.
+
+    Edges are counted, not their pieces; vertices where edges meet, and free ends, as they are drawn.
+    """
     scale = max(0.5 * width / REFERENCE_WIDTH, 0.4)
     thickness = max(round(2 * scale), 1)
     letter = cv2.getTextSize("0", cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)[0]
     strip = np.full((3 * letter[1], width, 3), 245, np.uint8)
     baseline, right = 2 * letter[1], width - letter[0]
-    for colour, words in ((CURVE_COLOUR, f"curves {len(edges.curves)}"), (LINE_COLOUR, f"lines {len(edges.lines)}")):
+    for symbol, words in reversed(_legend(wireframe)):
         right -= cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)[0][0]
         _write(strip, words, (right, baseline), scale)
-        middle = (right - letter[0] // 2, baseline - letter[1] // 2)
-        right = middle[0] - 2 * letter[0]
-        cv2.line(strip, (right, middle[1]), middle, colour[::-1], 2 * thickness, cv2.LINE_AA)
+        right -= 3 * letter[0]
+        middle = baseline - letter[1] / 2
+        symbol(strip, np.array([[right, middle], [right + 2 * letter[0], middle]]), 2.0 * thickness)
         right -= 2 * letter[0]
     fitting = max((right - letter[0]) // letter[0], 0)
     _write(strip, name[:fitting], (letter[0], baseline), scale)
     return strip
+
+
+def _legend(wireframe):
+    """What is drawn in the overlays, as (function that draws a sample between two pixels (2, 2), words)."""
+    lines, degrees = int(_are_lines(wireframe).sum()), wireframe.degrees
+
+    def stretch(colour):
+        return lambda strip, ends, stroke: _paint(strip, colour, stroke, [(1.0, ends[None])])
+
+    def mark(ring):
+        return lambda strip, ends, stroke: _mark(strip, ends.mean(axis=0)[None], stroke, ring)
+
+    return [
+        (stretch(LINE_COLOUR), f"lines {lines}"),
+        (stretch(CURVE_COLOUR), f"curves {len(wireframe) - lines}"),
+        (mark(ring=False), f"vertices {(degrees > 1).sum()}"),
+        (mark(ring=True), f"free ends {(degrees == 1).sum()}"),
+    ]
 
 
 def _write(picture, words, origin, scale):
@@ -164,27 +222,24 @@ def _write(picture, words, origin, scale):
     cv2.putText(picture, words, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, TEXT_COLOUR, thickness, cv2.LINE_AA)
 
 
-def _paint(picture, colour, segments, stroke):
-    """Paint segments, (m, 2, 3) homogeneous pixels, `stroke` pixels wide, with round ends; a point becomes a dot.
+def _paint(picture, colour, stroke, layers):
+    """Paint segments `stroke` pixels wide, with round ends; a point becomes a dot.
 
-    Through an oversampled mask: OpenCV's own anti-aliasing thickens a curve wherever two of its chords overlap.
+    layers: (opacity, (m, 2, 2) pixels), the later ones on top. Through an oversampled mask: OpenCV's own anti-aliasing
+    thickens a curve wherever two of its chords overlap.
     """
     height, width = picture.shape[:2]
     mask = np.zeros((height * OVERSAMPLING, width * OVERSAMPLING), np.uint8)
-    fine = OVERSAMPLING * segments[..., :2] / segments[..., 2:] + 0.5 * (OVERSAMPLING - 1)
-    ends = np.rint(fine * 2**SUBPIXEL_BITS).astype(np.int32)
-    cv2.polylines(mask, list(ends), False, 255, round(stroke * OVERSAMPLING), cv2.LINE_8, SUBPIXEL_BITS)
+    for opacity, segments in layers:
+        fine = OVERSAMPLING * segments + 0.5 * (OVERSAMPLING - 1)
+        ends = np.rint(fine * 2**SUBPIXEL_BITS).astype(np.int32)
+        cv2.polylines(
+            mask, list(ends), False, round(255 * opacity), round(stroke * OVERSAMPLING), cv2.LINE_8, SUBPIXEL_BITS
+        )
     coverage = cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA)
     touched = coverage > 0
     alpha = coverage[touched, None] / 255.0
     picture[touched] = (picture[touched] * (1.0 - alpha) + np.array(colour[::-1]) * alpha).round()
-
-
-def _end_vertices(segments, owners):
-    """The first and last vertex of every edge, from the segments (m, 2) and their edges (m,)."""
-    changes = np.flatnonzero(np.diff(owners))
-    first, last = np.concatenate([[0], changes + 1]), np.concatenate([changes, [len(owners) - 1]])
-    return np.concatenate([segments[first, 0], segments[last, 1]]) if len(owners) else np.zeros(0, np.int64)
 
 
 def _write_png(path, picture):

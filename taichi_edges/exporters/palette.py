@@ -6,6 +6,12 @@ import numpy as np
 LINE_COLOUR = (213, 94, 0)
 CURVE_COLOUR = (0, 114, 178)
 
+# The rest of the set, for programs that show each kind of edge in a layer of its own.
+KIND_COLOURS = {
+    "line": LINE_COLOUR, "arc": CURVE_COLOUR, "circle": (86, 180, 233), "elliptic_arc": (0, 158, 115),
+    "ellipse": (204, 121, 167), "spline": (230, 159, 0),
+}  # fmt: skip
+
 UNLABELLED_COLOUR = (150, 150, 150)  # what belongs to no cluster
 
 # Sasha Trubetskoy's list of distinct colours, without the grey, the near-whites and black; neighbours differ most.

@@ -1,7 +1,8 @@
-"""The vertices of a binary little-endian PLY file as a NumPy structured array, bit for bit.
+"""Binary little-endian PLY files as NumPy structured arrays, bit for bit.
 
-Open3D is no help in two places: its point cloud reader returns a file that was cut short as though it were whole, and
-its writer takes fields named `scale` for linear and clamps negative ones, where 3D Gaussian Splatting means logarithms.
+Open3D is no help in three places: its point cloud reader returns a file that was cut short as though it were whole, and
+its writer takes fields named `scale` for linear and clamps negative ones, where 3D Gaussian Splatting means logarithms;
+and its line sets have no properties beyond colours.
 """
 
 import numpy as np
@@ -15,6 +16,8 @@ NUMPY_TYPES = {
     "float32": "<f4", "float64": "<f8",
 }  # fmt: skip
 
+PLY_TYPES = {np.dtype(NUMPY_TYPES[name]): name for name in ("uchar", "int", "float", "double")}
+
 LONGEST_HEADER = 1 << 16  # bytes; a foreign file is given up after so many
 
 
@@ -22,11 +25,19 @@ def write_float_vertices(path, names, columns):
     """Write a PLY whose vertices carry the float32 properties `names`. columns: (n, len(names))."""
     columns = np.ascontiguousarray(columns, dtype="<f4")
     assert columns.ndim == 2 and columns.shape[1] == len(names), columns.shape
-    properties = "".join(f"property float {name}\n" for name in names)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(columns)}\n{properties}end_header\n"
+    return write_elements(path, {"vertex": columns.view([(name, "<f4") for name in names])[:, 0]})
+
+
+def write_elements(path, elements):
+    """Write a PLY of one element for each entry: its name, and a structured array (n,) of its properties."""
+    header = "ply\nformat binary_little_endian 1.0\n"
+    for element, rows in elements.items():
+        header += f"element {element} {len(rows)}\n"
+        header += "".join(f"property {PLY_TYPES[rows.dtype[name]]} {name}\n" for name in rows.dtype.names)
     with replacing(path) as unfinished, open(unfinished, "wb") as file:
-        file.write(header.encode("ascii"))
-        file.write(columns.tobytes())
+        file.write((header + "end_header\n").encode("ascii"))
+        for rows in elements.values():
+            file.write(rows.tobytes())
     return path
 
 

@@ -18,10 +18,10 @@ VIEW_ZOOM = 1.0  # Open3D's own 0.7 cuts off the corners of a cube seen obliquel
 WRITTEN_FILES = ("points.ply", "edges.ply", "edges.obj", "overlays/")
 
 
-def build_geometries(points, directions, edges):
+def build_geometries(points, directions, wireframe):
     """What the window shows: a PointCloud, a LineSet of short segments along the directions, a LineSet of the edges.
 
-    points: (n, 3) world units. directions: (n, 3) unit vectors. edges: EdgeSet in the same frame.
+    points: (n, 3) world units. directions: (n, 3) unit vectors. wireframe: Wireframe in the same frame.
     Empty geometries are left out, because Open3D warns about each.
     """
     import open3d as o3d
@@ -37,20 +37,21 @@ def build_geometries(points, directions, edges):
         ticks = o3d.geometry.LineSet(o3d.utility.Vector3dVector(ends), o3d.utility.Vector2iVector(pairs))
         ticks.paint_uniform_color(DIRECTION_COLOUR)
         geometries += [cloud, ticks]
-    if len(edges):
-        geometries.append(build_line_set(edges))
+    if len(wireframe):
+        geometries.append(build_line_set(wireframe))
     return geometries
 
 
-def show(points, directions, edges, written_files=WRITTEN_FILES):
+def show(points, directions, wireframe, written_files=WRITTEN_FILES):
     """Open a window and return when it is closed.
 
-    points, directions, edges: as in `build_geometries`. written_files: what to open instead where there is no display.
+    points, directions, wireframe: as in `build_geometries`. written_files: what to open instead where there is no
+    display.
     """
     instead = f"open {', '.join(str(name) for name in written_files)} instead"
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise UserError(f"viewer: no display (neither DISPLAY nor WAYLAND_DISPLAY is set); {instead}")
-    geometries = build_geometries(points, directions, edges)
+    geometries = build_geometries(points, directions, wireframe)
     if not geometries:
         raise UserError("viewer: there are neither points nor edges to show; run the stages before it")
     window = _open_window(instead)

@@ -1,0 +1,118 @@
+"""DXF for CAD programs: every edge as the entity that it is, arcs as arcs and splines as splines, in 3D.
+
+A layer for each kind. What the images say about an edge is extended data of the application TAICHI_EDGES: pairs of a
+name and a value. Numbers are those of the input's frame, which has no unit, and nor has the file.
+"""
+
+import contextlib
+
+import numpy as np
+
+from taichi_edges.artefacts import replacing
+from taichi_edges.exporters.naming import edge_name, refuse_empty
+from taichi_edges.exporters.nurbs import DEGREE, joined
+from taichi_edges.exporters.palette import KIND_COLOURS
+
+VERSION = "R2010"  # the oldest that all programs of today read with true colours
+APPLICATION = "TAICHI_EDGES"
+TEXT, REAL, INTEGER = 1000, 1040, 1071  # group codes of extended data
+VIEW_HEIGHT = 1.2  # of the longest side of the edges' box: what is in sight when the file is opened
+
+
+def write_dxf(path, wireframe):
+    """Write the edges of a Wireframe, in the frame the file shall have, as a DXF."""
+    refuse_empty(path, wireframe)
+    with _fixed_dates() as ezdxf, replacing(path) as unfinished:
+        document = ezdxf.new(VERSION, units=0)
+        document.appids.add(APPLICATION)
+        for kind in sorted({shape.kind for shape in wireframe.shapes}):
+            document.layers.add(layer_of(kind), true_color=ezdxf.rgb2int(KIND_COLOURS[kind]))
+        for number, edge in enumerate(wireframe.edges):
+            entity = ENTITIES[edge.shape.kind](document.modelspace(), edge.shape)
+            entity.dxf.layer = layer_of(edge.shape.kind)
+            entity.set_xdata(APPLICATION, _extended_data(number, edge))
+        _look_at(document, wireframe)
+        document.saveas(unfinished)
+    return path
+
+
+def layer_of(kind):
+    """'ELLIPTIC_ARCS'."""
+    return f"{kind.upper()}S"
+
+
+@contextlib.contextmanager
+def _fixed_dates():
+    """The module ezdxf, told to write no dates and no random identifiers: the same edges give the same bytes."""
+    import ezdxf
+
+    before = ezdxf.options.write_fixed_meta_data_for_testing
+    ezdxf.options.write_fixed_meta_data_for_testing = True
+    try:
+        yield ezdxf
+    finally:
+        ezdxf.options.write_fixed_meta_data_for_testing = before
+
+
+def _extended_data(number, edge):
+    """(group code, value) pairs."""
+    pairs = [(TEXT, "edge"), (INTEGER, number), (TEXT, "name"), (TEXT, edge_name(number, edge))]
+    if edge.evidence:
+        for name in ("confidence", "residual_px", "supported_length"):
+            pairs += [(TEXT, name), (REAL, float(getattr(edge.evidence, name)))]
+        pairs += [(TEXT, "views"), (INTEGER, int(edge.evidence.views))]
+    return pairs
+
+
+def _look_at(document, wireframe):
+    """Programs open the file with the edges in sight."""
+    points = np.concatenate([shape.cubics().reshape(-1, 3) for shape in wireframe.shapes])
+    low, high = points.min(axis=0), points.max(axis=0)
+    document.set_modelspace_vport(VIEW_HEIGHT * (high - low).max(), tuple((0.5 * (low + high))[:2].tolist()))
+
+
+def _add_line(space, line):
+    return space.add_line(*line.points.tolist())
+
+
+def _add_circle(space, circle):
+    centre, _ = _in_plane(circle)
+    return space.add_circle(centre, circle.radii.mean(), {"extrusion": circle.normal})
+
+
+def _add_arc(space, arc):
+    """Counter-clockwise about its normal, as our angles are."""
+    centre, start = _in_plane(arc)
+    angles = start + np.degrees([0.0, arc.high - arc.low])
+    return space.add_arc(centre, arc.radii.mean(), *(angles % 360.0), dxfattribs={"extrusion": arc.normal})
+
+
+def _in_plane(arc):
+    """Its centre in the coordinate system that DXF derives from the normal, and where it starts there, degrees."""
+    from ezdxf.math import OCS
+
+    system = OCS(arc.normal)
+    towards = system.from_wcs(arc.ends[0] - arc.centre)
+    return system.from_wcs(arc.centre), np.degrees(np.arctan2(towards.y, towards.x))
+
+
+def _add_ellipse(space, arc):
+    low, high = (0.0, 2 * np.pi) if arc.closed else (arc.low, arc.high)
+    ratio = arc.radii[1] / arc.radii[0]
+    return space.add_ellipse(arc.centre, arc.axes[0], ratio, low, high, {"extrusion": arc.normal})
+
+
+def _add_spline(space, spline):
+    """Without the flag of closed splines: some programs then make up knots of their own."""
+    same = joined(spline.curves)
+    return space.add_open_spline(same.control_points, DEGREE, same.all_knots.tolist())
+
+
+ENTITIES = {
+    "line": _add_line,
+    "circle": _add_circle,
+    "arc": _add_arc,
+    "ellipse": _add_ellipse,
+    "elliptic_arc": _add_ellipse,
+    "spline": _add_spline,
+}
