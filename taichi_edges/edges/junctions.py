@@ -25,6 +25,7 @@ SHARE = 0.4  # of an edge's length: its ends do not move inwards by more
 TANGENTIAL = np.cos(np.radians(18.0))  # edges that meet at a smaller angle run into each other
 LEVER_PX = 4.0  # how far apart in space two tangents count that differ by a radian
 END_WEIGHT = 1e3  # of the ends of a chain against the points between them
+FAR_ASIDE_PX, FAR_ALONG_PX = 0.3, 3.0  # usual errors of an end, across and along; pairs that ask for less go first
 FRUGAL = 0.05  # weight of the way of an end against the distance that it leaves
 
 
@@ -39,7 +40,7 @@ class Reach:
 
 @dataclass(frozen=True)
 class Meeting:
-    """Two ends, or an end and an edge. cost: how bad, in pixels. ways: of the ends. smooth: do they run on?"""
+    """Two ends. cost: how much it asks for, in usual errors. ways: of the ends. smooth: do they run on?"""
 
     cost: float
     first: int
@@ -116,7 +117,7 @@ def meet(i, j, first, second, pixel):
         return None  # they lie side by side
     if apart[a, b] > MEETING_PX * pixel:
         return None
-    cost = float(apart[a, b] + ways[a, b]) / pixel
+    cost = float(apart[a, b] / FAR_ASIDE_PX + (abs(first.ways[a]) + abs(second.ways[b])) / FAR_ALONG_PX) / pixel
     return Meeting(cost, i, j, (float(first.ways[a]), float(second.ways[b])), smooth)
 
 
