@@ -234,6 +234,17 @@ def test_lines_that_run_on_into_a_fillet_do_not_stand_for_it(tmp_path):
     assert evaluate(without_arc, truth)["tangential_joints_reached_percent"] == 0.0
 
 
+def test_a_contact_that_has_slid_along_is_closed_only_in_the_wide_sense(tmp_path):
+    """The fillet is of 90 mm instead of 100, so its contacts lie 10 mm on, joined as they should be."""
+    truth = edge_file_truth(tmp_path, filleted())
+    lines = [line([-0.5, 0, 0], [0.01, 0, 0]), line([0.1, 0.09, 0], [0.1, 0.6, 0])]
+    metrics = evaluate(EdgeSet.of(lines, [arc_piece([0.01, 0.09, 0], 0.09, -90, 0)]), truth)
+    assert metrics["tangential_joints_closed_percent"] == metrics["tangential_joints_reached_percent"] == 0.0
+    assert metrics["tangential_joints_closed_20mm_percent"] == 100.0
+    apart = evaluate(EdgeSet.of(lines, [arc_piece([0.01, 0.09, 0.001], 0.09, -90, 0)]), truth)
+    assert apart["tangential_joints_closed_20mm_percent"] == 0.0
+
+
 def test_a_line_that_touches_a_circle_has_a_tangential_joint_there(tmp_path):
     sources = np.full(4, 1)
     both = EdgeSet(np.array([line([0.7, 0.5, 0.5], [0.7, 0.9, 0.5])]), circle_pieces(4), np.array([0]), sources)
@@ -278,7 +289,7 @@ def test_order_and_sense_of_the_edges_do_not_matter(generator, tmp_path):
     first = evaluate(EdgeSet(lines, part.curves, part.line_sources, part.curve_sources), truth)
     second = evaluate(turned, truth)
     keys = [key for key in first if "corner" in key or "joint" in key or "free" in key or key.startswith("exact")]
-    assert len(keys) == 19
+    assert len(keys) == 20
     assert [second[key] for key in keys] == pytest.approx([first[key] for key in keys], abs=1e-3)
 
 

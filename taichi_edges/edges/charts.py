@@ -35,21 +35,23 @@ def moved(shape, ends, own):
     return MOVES[shape.kind](shape, ends, own)
 
 
-def derivatives(shape, ends, evaluated):
-    """Derivatives of what `evaluated` (a function of a shape) gives, an array, by the ends and the own unknowns.
+def neighbors(shape, ends):
+    """A shape with each of its unknowns a STEP ahead and a STEP behind: list of pairs of shapes.
 
-    Returns (..., 6 + k), or (..., k) for a closed shape, whose `ends` are None.
+    ends: (2, 3), the first six unknowns; None for a closed shape.
     """
     fixed = 0 if ends is None else 6
     start = np.concatenate([np.zeros(0) if ends is None else np.ravel(ends), np.zeros(own_unknowns(shape))])
-    columns = []
-    for step in STEP * np.eye(len(start)):
-        ahead, behind = (
-            evaluated(moved(shape, at[:6].reshape(2, 3) if fixed else None, at[fixed:]))
-            for at in (start + step, start - step)
-        )
-        columns.append((ahead - behind) / (2 * STEP))
-    return np.stack(columns, axis=-1)
+
+    def at(unknowns):
+        return moved(shape, unknowns[:6].reshape(2, 3) if fixed else None, unknowns[fixed:])
+
+    return [(at(start + step), at(start - step)) for step in STEP * np.eye(len(start))]
+
+
+def derivatives(pairs, evaluated):
+    """Derivatives (..., k) by the unknowns of what `evaluated`, a function of a shape, gives. pairs: the neighbors."""
+    return np.stack([(evaluated(ahead) - evaluated(behind)) / (2 * STEP) for ahead, behind in pairs], axis=-1)
 
 
 def nearest_parameters(shape, points):

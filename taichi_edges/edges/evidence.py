@@ -156,13 +156,13 @@ class Support:
         return np.sqrt(self.samples.sums(squares) / np.maximum(self.samples.sums(found), 1))
 
 
-def support_of(matching, shapes, radius=MATCH_PX, spacing=SPACING_PX):
-    """The Support of shapes. matching: EdgelMatching. radius, spacing: px, of matches and of the samples.
+def support_of(matching, shapes, radius=MATCH_PX):
+    """The Support of shapes. matching: EdgelMatching. radius: px, of the matches.
 
     The noise can make an edgel nearer to the wrong one of two edges, so an edge with fewer views on its length than the
     best one counts as farther away, by up to TIE_NOISES times the noise.
     """
-    samples = Samples.along(shapes, spacing * matching.pixel)
+    samples = Samples.along(shapes, SPACING_PX * matching.pixel)
     edgels, residuals = _matches(matching, samples.points, samples.directions, radius)
     nearest = _owned(matching, samples, edgels, residuals, np.zeros(len(shapes)))
     strengths = samples.sums(nearest.views) / np.maximum(np.diff(samples.starts), 1)

@@ -82,9 +82,9 @@ def followers(predicted, truth):
 
 @dataclass(frozen=True)
 class Arrivals:
-    """The predicted edges that come within REACH of a joint and follow one of its true edges.
+    """The predicted edges that come within reach of a joint and follow one of its true edges.
 
-    edges: (a,) int, ascending. follows: {true edge: (a,) bool}. ends: (e,) int, the predicted ends within REACH.
+    edges: (a,) int, ascending. follows: {true edge: (a,) bool}. ends: (e,) int, the predicted ends within reach.
     end_counts: (a,) how many of them each edge has. passes: (a,) bool: it has none, and follows two of the true ends,
     or a true edge that passes. (What follows a single true end and runs on past it serves nothing.)
     """
@@ -96,17 +96,19 @@ class Arrivals:
     passes: np.ndarray
 
 
-def judge_joints(predicted, truth, joints):
-    """For each joint, whether it is reached and whether it is closed: (J, 2) bool."""
+def judge_joints(predicted, follows, joints, reach=REACH):
+    """For each joint, whether it is reached and whether it is closed: (J, 2) bool.
+
+    follows: as from `followers`. reach: how near to a joint an edge has to end, normalised units.
+    """
     points = np.array([joint.point for joint in joints]).reshape(-1, 3)
-    follows = followers(predicted, truth)
-    at, pieces, _, _ = predicted.dense.within(points, REACH)
+    at, pieces, _, _ = predicted.dense.within(points, reach)
     end_distances = np.linalg.norm(predicted.ends.points[None] - points[:, None], axis=2)
     verdicts = np.zeros((len(joints), 2), dtype=bool)
     for number, joint in enumerate(joints):
         near = np.unique(predicted.edges[pieces[at == number]])
-        arrivals = arrivals_at(predicted, joint, follows, near, np.flatnonzero(end_distances[number] <= REACH))
-        groups = joined_groups(predicted, joint, arrivals)
+        arrivals = arrivals_at(predicted, joint, follows, near, np.flatnonzero(end_distances[number] <= reach))
+        groups = joined_groups(predicted, joint, arrivals, reach)
         verdicts[number] = [
             all_served(joint, arrivals, np.arange(len(arrivals.edges))),
             any(all_served(joint, arrivals, group) for group in groups),
@@ -115,7 +117,7 @@ def judge_joints(predicted, truth, joints):
 
 
 def arrivals_at(predicted, joint, follows, near, ends):
-    """The Arrivals at a joint. follows: as from `followers`. near, ends: the edges and the ends within REACH of it."""
+    """The Arrivals at a joint. follows: as from `followers`. near, ends: the edges and the ends within reach of it."""
     edges = near[follows[near][:, [*joint.ends, *joint.passing]].any(axis=1)]
     followed = {true_edge: follows[edges, true_edge] for true_edge in (*joint.ends, *joint.passing)}
     end_counts = np.bincount(predicted.ends.edges[ends], minlength=len(follows))[edges]
@@ -123,7 +125,7 @@ def arrivals_at(predicted, joint, follows, near, ends):
     return Arrivals(edges, followed, ends, end_counts, (end_counts == 0) & (ways > 1))
 
 
-def joined_groups(predicted, joint, arrivals):
+def joined_groups(predicted, joint, arrivals, reach):
     """The edges that are joined at a joint: list of lists of indices into `arrivals.edges`.
 
     An end joins what it touches. Edges without an end here are joined if they touch each other and both pass.
@@ -134,15 +136,15 @@ def joined_groups(predicted, joint, arrivals):
     pairs = zip(predicted.ends.edges[ends[here]].tolist(), predicted.edges[pieces[here]].tolist(), strict=True)
     pairs = [(place[one], place[other]) for one, other in pairs if one in place and other in place]
     if np.count_nonzero(arrivals.passes) > 1:
-        touching = touching_edges(predicted, joint, arrivals.edges)
+        touching = touching_edges(predicted, joint, arrivals.edges, reach)
         pairs += [pair for pair in touching if arrivals.passes[list(pair)].all()]
     return grouped(len(place), pairs)
 
 
-def touching_edges(predicted, joint, edges):
+def touching_edges(predicted, joint, edges, reach):
     """List of pairs of indices into `edges`, predicted ones that come within JOINED of each other near the joint."""
     dense = predicted.dense
-    vertices = np.array(dense.tree.query_ball_point(joint.point, REACH), dtype=np.int64)
+    vertices = np.array(dense.tree.query_ball_point(joint.point, reach), dtype=np.int64)
     owners = predicted.edges[dense.owners[vertices]]
     at, pieces, _, _ = dense.within(dense.points[vertices], JOINED)
     pairs = np.unique(np.stack([owners[at], predicted.edges[pieces]], axis=1), axis=0)

@@ -18,7 +18,7 @@ BLADE_SECTIONS = (  # turn in degrees, chord, shift in x and y of the four rows 
     (24.0, 0.44, (0.08, -0.06)),
     (48.0, 0.36, (-0.04, 0.0)),
 )
-HYPERBOLA_PIECES = 4  # the cubics leave the hyperbola by 4e-9 drawn units
+HYPERBOLA_PIECES = 4  # the cubics leave the hyperbola by less than 4e-9 drawn units
 
 
 def pipe():
@@ -28,7 +28,7 @@ def pipe():
     outside, inside = circle((0.0, 0.0), outer), circle((0.0, 0.0), inner).reversed()
     surfaces = [swept(path, places) for path in (outside, inside)]
     end = Profile(outside, (inside,))
-    surfaces += [cap(end, 0.0, upward).placed(*places[-upward]) for upward in (False, True)]
+    surfaces += [cap(end, 0.0, upward=False).placed(*places[0]), cap(end, 0.0, upward=True).placed(*places[-1])]
     return assemble("pipe", surfaces)
 
 

@@ -81,7 +81,7 @@ def rims():
 
 
 def grille():
-    """A thin plate with bowed rows of slanted and round openings, 6 pixels wide bars between: 156 lines, 12 circles.
+    """A thin plate with bowed rows of slanted and round openings, bars of 6 pixels between: 156 lines, 12 circles.
 
     No corners of openings lie in one line: the triangulation would leave the middle ones out.
     """
