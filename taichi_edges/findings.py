@@ -76,11 +76,12 @@ def describe_refine(facts):
 
 
 def describe_evaluate(facts):
-    """'F-score 72.6 % at 5 mm, 73.5 % at 10 mm, 74.6 % at 20 mm', or that there is no ground truth."""
+    """'F-score 72.6 % at 5 mm, 73.5 % at 10 mm, 74.6 % at 20 mm; 7 of 8 corners closed', or that there is no truth."""
     if facts["ground_truth"] is None:
         return "no ground truth, so only the edges are counted"
     shares = [f"{facts[f'f_score_{limit}mm_percent']:.1f} % at {limit} mm" for limit in (5, 10, 20)]
-    return f"F-score {', '.join(shares)}"
+    corners = f"; {facts['corners_closed']} of {facts['corners']} corners closed" if facts.get("corners") else ""
+    return f"F-score {', '.join(shares)}{corners}"
 
 
 def describe_export(facts):

@@ -151,7 +151,7 @@ def test_block_shows_nine_of_its_twelve_edges(parts):
         assert far.sum() > 100 and values[far].max() == 0
 
 
-@pytest.mark.parametrize("name", ["bracket", "wave", "demo"])
+@pytest.mark.parametrize("name", ["bracket", "wave", "demo", "nut", "blade"])
 def test_drawn_edges_are_centred_on_the_projected_curves(parts, name):
     maps, (lenses, poses) = edge_maps_of(parts[name], view_count=3)
     across = np.arange(-4, 4.01, 0.25)
@@ -176,7 +176,7 @@ def test_drawn_edges_are_centred_on_the_projected_curves(parts, name):
     assert np.abs(errors).max() < 0.1
 
 
-@pytest.mark.parametrize("name", ["knob", "demo"])
+@pytest.mark.parametrize("name", ["knob", "demo", "pipe", "fillet", "blade"])
 def test_edges_and_contours_together_outline_the_part(parts, name):
     with_contours = dataclasses.replace(CLEAN, contours=True)
     maps, cameras = edge_maps_of(parts[name], view_count=4, imperfections=with_contours)

@@ -109,13 +109,30 @@ class Arc:
             return Line(self.at(np.array([self.low, self.high])))
         tangent, inward, _ = self.frame
         axes = np.array([-inward, tangent]) / self.curvature
-        low, high = self.low * self.curvature, self.high * self.curvature
+        low = self.low * self.curvature
+        high = low + 2 * np.pi if self.closed else self.high * self.curvature
         return EllipticArc(self.origin + inward / self.curvature, axes, low, high)
 
     def over(self, low, high):
         """The same arc with other ends; closed if these are a round apart."""
         whole = high - low >= self.round * (1 - 1e-9)
         return replace(self, low=low, high=low + self.round if whole else high, closed=bool(whole))
+
+
+def through_three(start, middle, end):
+    """The Arc from one point through another to a third, origin at the middle one; None where they are on a line."""
+    first, second = start - middle, end - middle
+    normal = cross(first, second)
+    double = normal @ normal
+    if double <= 1e-12 * (first @ first) * (second @ second):
+        return None
+    to_centre = cross((first @ first) * second - (second @ second) * first, normal) / (2 * double)
+    squared = to_centre @ to_centre
+    tangent = cross(normal, to_centre)
+    tangent /= np.sqrt(tangent @ tangent)
+    angles = [np.arctan2(way @ tangent * np.sqrt(squared), squared - way @ to_centre) for way in (first, second)]
+    low, high = (np.array([angles[0] % (2 * np.pi) - 2 * np.pi, angles[1] % (2 * np.pi)]) * np.sqrt(squared)).tolist()
+    return Arc(middle, tangent, to_centre / squared, low, high)
 
 
 def cross(a, b):

@@ -149,17 +149,17 @@ def total_turning(points, arc):
 def _fit_spline(points, parameters, weights, pieces, closed):
     """Least-squares chain of cubics over parameters in 0..1, in `pieces` equal spans -> (pieces, 4, 3) Beziers."""
     if not closed:
-        return _lsq_chain(parameters * pieces, points, weights, pieces)
+        return lsq_chain(parameters * pieces, points, weights, pieces)
     # The data repeated on both sides make the middle period periodic.
     parameters = np.concatenate([parameters, parameters + 1, parameters + 2])
-    chain = _lsq_chain(parameters * pieces, np.tile(points, (3, 1)), np.tile(weights, 3), 3 * pieces)
+    chain = lsq_chain(parameters * pieces, np.tile(points, (3, 1)), np.tile(weights, 3), 3 * pieces)
     controls = chain[pieces : 2 * pieces].copy()
     joint = 0.5 * (controls[0, 0] + controls[-1, 3])
     controls[0, 0] = controls[-1, 3] = joint
     return controls
 
 
-def _lsq_chain(parameters, points, weights, pieces):
+def lsq_chain(parameters, points, weights, pieces):
     """Weighted least-squares chain of cubics with a continuous tangent; piece i has the parameters i .. i + 1.
 
     With equal spans a joint is the middle of the two control points next to it, so the unknowns are the polygon of the

@@ -1,12 +1,28 @@
 """From single edges to a wireframe: connected, minimal, in agreement with the images."""
 
 from dataclasses import dataclass
+from functools import partial
+
+from taichi_edges.edges.continuation import Merging, continued
+from taichi_edges.edges.evidence import claims_of, support_along, supported
+from taichi_edges.edges.extents import extended
+from taichi_edges.edges.junctions import connected
+from taichi_edges.edges.model_selection import Yardstick
+from taichi_edges.kernels.edgel_matching import EdgelMatching
+
+NOISE_PX = 0.2  # by which a place on an edge may be off its shape, at least: next to other edges every detector is
+STRETCH_PX = 4.0  # length of an edge on which the errors go together
+WIDE_GAP_PX = 24.0  # between strokes that continue each other, where their ends are still free after the first pass
+LEAST_SUPPORTED = 0.5  # of the length of an edge
 
 
 @dataclass(frozen=True)
 class RefineCounts:
-    """What the refinement did."""
+    """What the refinement did: circles completed, strokes joined to others, and what was left out."""
 
+    circles: int = 0
+    joined: int = 0
+    duplicates: int = 0
     unsupported: int = 0
 
 
@@ -15,4 +31,32 @@ def refine_wireframe(loose, views, config):
 
     views: Views. config: the scene's `refine` section. ti.init must have been called.
     """
-    return loose, RefineCounts()
+    if not config.enabled or not len(loose):
+        return loose, RefineCounts()
+    matching = EdgelMatching(views)
+    yardstick = Yardstick(NOISE_PX * matching.pixel, STRETCH_PX * matching.pixel)
+    seen, pixel = partial(support_along, matching), matching.pixel
+    shapes, first = continued(loose.shapes, yardstick, pixel, seen)
+    kept = with_support(matching, shapes)
+    shapes, second = continued(with_longer_ends(matching, kept), yardstick, pixel, seen, WIDE_GAP_PX)
+    wireframe = connected(with_support(matching, shapes), pixel)
+    counts = [getattr(first, name) + getattr(second, name) for name in Merging.__dataclass_fields__]
+    return wireframe, RefineCounts(*counts, len(shapes) - len(wireframe))
+
+
+def with_support(matching, shapes):
+    """The shapes that the images support on half of their length, at least."""
+    pairs = zip(shapes, supported(matching, shapes), strict=True)
+    return [shape for shape, found in pairs if found.supported_length >= LEAST_SUPPORTED * shape.length]
+
+
+def with_longer_ends(matching, shapes):
+    """The shapes, ends that would meet no other extended as far as the images show them."""
+    wireframe, claims = connected(shapes, matching.pixel), claims_of(matching, shapes)
+    degrees = wireframe.degrees
+    longer = []
+    for number, (shape, edge) in enumerate(zip(shapes, wireframe.edges, strict=True)):
+        free = [side for side, end in enumerate(edge.vertices) if degrees[end] == 1]
+        seen = partial(support_along, matching, claims=claims, own=number)
+        longer.append(extended(shape, free, seen, matching.pixel) if free else shape)
+    return longer

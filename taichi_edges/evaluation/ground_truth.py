@@ -22,6 +22,7 @@ from taichi_edges.errors import UserError, did_you_mean, name_some
 
 ABC_SPACING = 0.005  # raw CAD units (!), EMAP get_gt_points: the spacing in the unit cube differs from model to model
 EDGE_FILE_SPACING = 0.0005  # normalised units: a tenth of the finest threshold, so the sampling does not show
+CURVE_SEGMENTS = 128  # chords of each cubic of an edge file: 90 degrees at radius 0.5, the largest, to 0.01 mm
 INTERIOR_FACTOR = 1000.0  # ABC stores the interior vert_parameters of circles and B-splines multiplied by this
 SAME_VERTEX = 1e-4  # of the longest side: two curves that share a vertex must rebuild it this closely
 SAME_JOINT = 1e-6  # normalised units: pieces of one edge whose ends are this close are one curve
@@ -276,7 +277,7 @@ def join_pieces(edges):
 
     A Bezier piece that starts where the piece before it ends, and shares its source, goes on with that polyline.
     """
-    pieces = edges.polylines()
+    pieces = edges.polylines(CURVE_SEGMENTS)
     curves, kinds = pieces[: len(edges.lines)], ["line"] * len(edges.lines)
     previous = -1
     for piece, source in zip(pieces[len(edges.lines) :], edges.curve_sources, strict=True):

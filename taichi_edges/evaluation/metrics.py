@@ -1,4 +1,6 @@
-"""EMAP's metrics of a set of edges against the ground truth, and what they do not show: lengths and duplicates.
+"""EMAP's metrics of a set of edges against the ground truth, and beside them what judges a wireframe.
+
+`duplicates`, `primitives` and `wireframe_metrics` measure what EMAP's metrics do not show; docs/metrics.md lists all.
 
 Protocol (EMAP, src/eval/eval_ABC.py and eval_util.py). The prediction is sampled at int(length // 0.005) points per
 edge, uniform in the parameter, both ends included, cast to float32 and averaged per voxel of a 256^3 grid over
@@ -8,44 +10,85 @@ Precision, recall and F count the points that are nearer than 5, 10 and 20 mm, s
 One "mm" is 0.001 of the normalised unit. Edges and truth must be in the same frame, the normalised one.
 """
 
+from collections import defaultdict
+
 import numpy as np
 
 from taichi_edges.bezier import evaluate_bezier
 from taichi_edges.errors import UserError
+from taichi_edges.evaluation.dense_curves import STEP
+from taichi_edges.evaluation.duplicates import duplicated_percent
+from taichi_edges.evaluation.primitives import true_primitives
+from taichi_edges.evaluation.wireframe import wireframe
+from taichi_edges.evaluation.wireframe_metrics import wireframe_metrics
 
 SAMPLE_SPACING = 0.005  # normalised units, EMAP sample_resolution
 VOXELS_PER_UNIT = 128  # EMAP: 256 voxels over [-1, 1] on each axis
 THRESHOLDS_MM = (5, 10, 20)  # EMAP
 UNIT_MM = 1000.0  # "mm" in one normalised unit
-
-DUPLICATE_SPACING = 0.002  # normalised units between samples: reads a distance of 5 mm at most 0.1 mm too long
-DUPLICATE_DISTANCE = 0.005  # normalised units: the finest threshold, below which two edges tell the metrics the same
-DUPLICATE_COSINE = 0.9  # between tangents: edges that meet at more than 26 degrees never count as parallel
+FEWEST_CHORDS = 16  # of a cubic, for exact distances; one of 90 degrees is met to 0.1 % of its radius
 
 
 def evaluate(edges, truth):
     """The metrics of `edges`, an EdgeSet, against `truth`, a GroundTruth in the same frame.
 
     Returns a dict of floats and ints that JSON can hold; None where a number does not exist: distances of a prediction
-    without points, lengths and duplicates of a truth that is known by its samples only.
+    without points, shares of corners that do not exist, all that asks for the curves of a truth that is known by its
+    samples only.
     """
     refuse_unbounded(edges)
-    predicted_length = float(edges.lengths.sum())
     sources = piece_sources(edges)
-    metrics = {
+    true = true_wireframe(truth)
+    metrics = count_metrics(edges, truth, sources, true) | length_metrics(edges, truth, sources)
+    metrics |= wireframe_metrics(wireframe(exact_polylines(edges), sources), true)
+    return metrics | point_metrics(sample_prediction(edges), truth.points.astype(np.float32))
+
+
+def count_metrics(edges, truth, sources, true):
+    """How many pieces and edges there are. true: the Wireframe of the true primitives, or None."""
+    count = len(np.unique(sources))
+    return {
         "lines": len(edges.lines),
         "curves": len(edges.curves),
-        "edges": len(np.unique(sources)),
-        "true_edges": len(truth.curves) or None,
-        "predicted_length_units": predicted_length,
+        "edges": count,
+        "true_edges": len(true.polylines) if true else None,
+        "true_edges_as_filed": len(truth.curves) or None,
+        "edges_to_true_edges": count / len(true.polylines) if true else None,
+    }
+
+
+def length_metrics(edges, truth, sources):
+    """Lengths, and how much of them repeats what has been said."""
+    length = float(edges.lengths.sum())
+    duplicated = duplicated_percent(edges.polylines(), sources)
+    metrics = {
+        "predicted_length_units": length,
         "true_length_units": truth.length,
-        "predicted_to_true_length_percent": 100.0 * predicted_length / truth.length if truth.length else None,
-        "duplicated_length_percent": duplicated_percent(edges.polylines(), sources),
+        "predicted_to_true_length_percent": 100.0 * length / truth.length if truth.length else None,
+        "duplicated_length_percent": duplicated,
         "true_duplicated_length_percent": None,
+        "excess_duplicated_length_percent": None,
     }
     if truth.curves:
-        metrics["true_duplicated_length_percent"] = duplicated_percent(truth.curves, np.arange(len(truth.curves)))
-    return metrics | point_metrics(sample_prediction(edges), truth.points.astype(np.float32))
+        true_share = duplicated_percent(truth.curves, np.arange(len(truth.curves)))
+        metrics["true_duplicated_length_percent"] = true_share
+        metrics["excess_duplicated_length_percent"] = duplicated - true_share
+    return metrics
+
+
+def exact_polylines(edges):
+    """One (m, 3) polyline for each piece, lines first, with chords of about STEP: 0.01 mm off at a radius of 3 mm."""
+    counts = np.maximum(np.ceil(edges.lengths[len(edges.lines) :] / STEP), FEWEST_CHORDS).astype(int)
+    cubics = zip(edges.curves, counts, strict=True)
+    return [*edges.lines, *(evaluate_bezier(control, np.linspace(0.0, 1.0, count + 1)) for control, count in cubics)]
+
+
+def true_wireframe(truth):
+    """The Wireframe of the primitives of a GroundTruth; None where only samples are known."""
+    if not truth.curves:
+        return None
+    primitives = true_primitives(truth.curves, truth.kinds)
+    return wireframe(primitives, np.arange(len(primitives)))
 
 
 def refuse_unbounded(edges):
@@ -127,112 +170,12 @@ def share_nearer_percent(distances, threshold_mm):
     return 100.0 * int(np.count_nonzero(distances < np.float32(threshold_mm / UNIT_MM))) / len(distances)
 
 
-# ------------------------------------------------------------------------------------------------------ duplicates
-
-
-def duplicated_percent(polylines, sources):
-    """Percent of the length of the polylines that repeats what another, longer edge says already.
-
-    polylines: list of (m, 3). sources: (P,) int, pieces of one edge share it.
-    Pieces are counted one after the other: those of the longest edge (summed over its source) first, equal ones as
-    they come. A stretch of a piece is a duplicate where, for one of the pieces counted before it,
-    * the nearest point of that piece is at most DUPLICATE_DISTANCE away and not a duplicate itself;
-    * the two tangents there are parallel: |cos| >= DUPLICATE_COSINE;
-    * that point lies beside the stretch, not before it: where the other piece has already ended, the stretch goes on
-      with it and repeats nothing. So pieces of one circle, and lines that continue each other, are no duplicates of
-      each other, but a piece that runs back over another is one, even of the same source.
-    Edges that meet or cross at more than 26 degrees never count; those that meet at a sharper angle (a spline that
-    touches a circle) do, near the corner, and so do true edges less than 5 mm apart: compare with the number of the
-    truth itself.
-    """
-    points, tangents, steps, pieces, ends = middle_samples(polylines)
-    total = steps.sum()
-    if not total:
-        return 0.0
-    rank = rank_pieces(np.bincount(pieces, weights=steps, minlength=len(polylines)), sources)
-    later, earlier = neighbours_counted_before(points, pieces, rank)
-    offset = points[later] - points[earlier]
-    parallel = np.abs((tangents[later] * tangents[earlier]).sum(axis=1)) >= DUPLICATE_COSINE
-    outward = (offset * tangents[earlier]).sum(axis=1)
-    # A sample stands for half a step to each side; the quarter closes the gap where two pieces of a bent curve join.
-    reach = steps[earlier] / 2 + steps[later] / 4
-    beyond = ((ends[earlier, 0]) & (outward < -reach)) | ((ends[earlier, 1]) & (outward > reach))
-    beside = parallel & ~beyond
-    duplicated = mark_in_turn(later[beside], earlier[beside], rank[pieces])
-    return float(100.0 * steps[duplicated].sum() / total)
-
-
-def middle_samples(polylines):
-    """The middles of equal steps of at most DUPLICATE_SPACING along each polyline; none for one of no length.
-
-    Returns points (n, 3), unit tangents (n, 3), step lengths (n,), the index of the polyline (n,), and (n, 2) bool:
-    whether the sample is the first, the last of its polyline.
-    """
-    parts = [(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 2), bool))]
-    for index, polyline in enumerate(polylines):
-        chords = np.diff(polyline, axis=0)
-        lengths = np.linalg.norm(chords, axis=1)
-        chords, lengths, starts = chords[lengths > 0], lengths[lengths > 0], polyline[:-1][lengths > 0]
-        arc = np.concatenate([[0.0], np.cumsum(lengths)])
-        count = int(np.ceil(arc[-1] / DUPLICATE_SPACING))
-        at = (np.arange(count) + 0.5) * arc[-1] / max(count, 1)
-        chord = np.minimum(np.searchsorted(arc, at, side="right") - 1, len(lengths) - 1)
-        tangents = chords[chord] / lengths[chord, None]
-        points = starts[chord] + (at - arc[chord])[:, None] * tangents
-        number = np.arange(count)
-        ends = np.stack([number == 0, number == count - 1], axis=1)
-        parts.append((points, tangents, np.full(count, arc[-1] / max(count, 1)), np.full(count, index), ends))
-    return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
-
-
-def rank_pieces(lengths, sources):
-    """(P,) lengths and sources -> (P,) the turn in which each piece is counted: 0 for a piece of the longest edge."""
-    _, edge = np.unique(sources, return_inverse=True)
-    edge_lengths = np.bincount(edge, weights=lengths)
-    order = np.lexsort((np.arange(len(lengths)), edge, -edge_lengths[edge]))
-    rank = np.empty(len(lengths), dtype=np.int64)
-    rank[order] = np.arange(len(lengths))
-    return rank
-
-
-def neighbours_counted_before(points, pieces, rank):
-    """For every sample, the nearest sample of each piece counted before its own, if within DUPLICATE_DISTANCE.
-
-    Returns two (k,) index arrays: the sample, and its neighbour on the earlier piece.
-    """
-    from scipy.spatial import cKDTree
-
-    pairs = cKDTree(points).query_pairs(DUPLICATE_DISTANCE, output_type="ndarray")
-    pairs = pairs[pieces[pairs[:, 0]] != pieces[pairs[:, 1]]]
-    swap = rank[pieces[pairs[:, 0]]] < rank[pieces[pairs[:, 1]]]
-    later, earlier = np.where(swap, pairs[:, 1], pairs[:, 0]), np.where(swap, pairs[:, 0], pairs[:, 1])
-    distances = np.linalg.norm(points[later] - points[earlier], axis=1)
-    order = np.lexsort((distances, pieces[earlier], later))
-    later, earlier = later[order], earlier[order]
-    nearest = np.ones(len(order), dtype=bool)
-    nearest[1:] = (np.diff(later) != 0) | (np.diff(pieces[earlier]) != 0)
-    return later[nearest], earlier[nearest]
-
-
-def mark_in_turn(later, earlier, turns):
-    """(n,) bool: the samples that repeat one which is not a duplicate itself, decided turn by turn.
-
-    later, earlier: (k,) pairs of samples. turns: (n,) the turn of every sample.
-    """
-    duplicated = np.zeros(len(turns), dtype=bool)
-    order = np.argsort(turns[later], kind="stable")
-    later, earlier = later[order], earlier[order]
-    borders = np.flatnonzero(np.diff(turns[later])) + 1
-    for now, before in zip(np.split(later, borders), np.split(earlier, borders), strict=True):
-        duplicated[now[~duplicated[before]]] = True
-    return duplicated
-
-
 # ---------------------------------------------------------------------------------------------------- for printing
 
 
 def metrics_rows(metrics):
     """The dict of `evaluate` as rows (label, value with unit) for printing."""
+    metrics = defaultdict(lambda: None, metrics)  # a run that an earlier version has scored lacks some
     true_length = number_text(metrics["true_length_units"])
     rows = [
         ("lines, curves", f"{metrics['lines']}, {metrics['curves']}"),
@@ -244,6 +187,12 @@ def metrics_rows(metrics):
             f"{metrics['duplicated_length_percent']:.1f} % "
             f"(truth {number_text(metrics['true_duplicated_length_percent'], '{:.1f} %')})",
         ),
+        ("corners closed", joints_text(metrics, "corners")),
+        ("tangential joints closed", joints_text(metrics, "tangential_joints")),
+        ("free ends", free_ends_text(metrics)),
+        ("distance to true curves", spread_text(metrics, ("exact_mean_mm", "exact_median_mm", "exact_p95_mm"))),
+        ("distance of true curves", spread_text(metrics, ("exact_completeness_mean_mm", "exact_completeness_p95_mm"))),
+        ("true length within 5 mm", number_text(metrics["exact_recall_5mm_percent"], "{:.1f} %")),
         ("accuracy", number_text(metrics["accuracy_mm"], "{:.2f} mm")),
         ("completeness", number_text(metrics["completeness_mm"], "{:.2f} mm")),
     ]
@@ -256,3 +205,25 @@ def metrics_rows(metrics):
 def number_text(value, pattern="{:.2f}"):
     """The value in the pattern, or 'unknown' for None."""
     return "unknown" if value is None else pattern.format(value)
+
+
+def joints_text(metrics, name):
+    """'10 of 12 (reached: 91.7 %)', 'none in the truth' or 'unknown'."""
+    if not metrics[name]:
+        return "unknown" if metrics[name] is None else "none in the truth"
+    return f"{metrics[f'{name}_closed']} of {metrics[name]} (reached: {metrics[f'{name}_reached_percent']:.1f} %)"
+
+
+def free_ends_text(metrics):
+    """'14 (6 at corners, 3 at no true end)', only the number where the true curves are unknown."""
+    if metrics["false_free_ends"] is None:
+        return number_text(metrics["free_ends"], "{:d}")
+    places = f"{metrics['free_ends_at_corners']} at corners, {metrics['false_free_ends']} at no true end"
+    return f"{metrics['free_ends']} ({places})"
+
+
+def spread_text(metrics, keys):
+    """'0.31 mm mean, 0.22 mm median, 0.95 mm p95', of those of the keys; 'unknown' where they are."""
+    if metrics[keys[0]] is None:
+        return "unknown"
+    return ", ".join(f"{metrics[key]:.2f} mm {key.split('_')[-2]}" for key in keys)

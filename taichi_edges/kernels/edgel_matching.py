@@ -75,6 +75,23 @@ class EdgelMatching:
         add_equations(*blocks_of(points), points, directions, self.cameras, *edgels, *gates, equations)
         return download(equations)
 
+    @cached_property
+    def planes(self):
+        """(e, 5) float32, where kernels run: position, normal and strength of each edgel."""
+        columns = [self.edgels.points, self.edgels.normals, self.edgels.strengths[:, None]]
+        return upload(np.concatenate(columns, axis=1).astype(np.float32))
+
+    def equations_of(self, points, edgels, scale):
+        """`equations` of the edgels that each point is said to have: (n, V) int32 index into Edgels, -1 none.
+
+        The last of the EQUATIONS, the number of views that have the point in the image, stays 0.
+        """
+        equations = upload(np.zeros((len(points), EQUATIONS), np.float32))
+        points, edgels = upload(np.asarray(points, np.float32)), upload(np.asarray(edgels, np.int32))
+        if points.shape[0]:
+            add_equations_of(*blocks_of(points), points, self.cameras, edgels, self.planes, float(scale), equations)
+        return download(equations)
+
     def matches(self, points, directions, views, radius):
         """(n, v) int32: the edgel, an index into Edgels, that each point has in some views (a slice); -1 none.
 
@@ -228,3 +245,36 @@ def find_matches(
                     if element >= 0:
                         du, dv = pixel[0] - elements[element, 0], pixel[1] - elements[element, 1]
                         residuals[i, column] = du * elements[element, 2] + dv * elements[element, 3]
+
+
+@ti.kernel
+def add_equations_of(
+    size: ti.i32,
+    blocks: ti.i32,
+    points: F32_2D,
+    cameras: F32_3D,
+    edgels: I32_2D,
+    planes: F32_2D,
+    scale: ti.f32,
+    equations: F32_2D,
+):
+    """The sums of `add_equations` over edgels (n, V) that are known, -1 none; planes (e, 5) as in EdgelMatching."""
+    for block in range(blocks):
+        for view in range(cameras.shape[0]):
+            camera = load_camera(cameras, view)
+            for i in range(block * size, ti.min((block + 1) * size, points.shape[0])):
+                edgel = edgels[i, view]
+                if edgel >= 0:
+                    pixel, slopes, _, _ = project_line(camera, load_point(points, i), ti.Vector([1.0, 0.0, 0.0]))
+                    normal = ti.Vector([planes[edgel, 2], planes[edgel, 3]])
+                    residual = normal.dot(pixel - ti.Vector([planes[edgel, 0], planes[edgel, 1]]))
+                    slope = normal @ slopes
+                    weight = planes[edgel, 4] / (1.0 + (residual / scale) ** 2) ** 2
+                    k = 0
+                    for a in ti.static(range(3)):
+                        for b in ti.static(range(a, 3)):
+                            equations[i, k] = equations[i, k] + weight * slope[a] * slope[b]
+                            k += 1
+                    for a in ti.static(range(3)):
+                        equations[i, 6 + a] = equations[i, 6 + a] + weight * residual * slope[a]
+                    equations[i, 9] = equations[i, 9] + weight

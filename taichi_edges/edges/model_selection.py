@@ -1,0 +1,190 @@
+"""Which shape describes a stretch of edge best: a line, an arc of a circle or an ellipse, a chain of cubics.
+
+The criterion is BIC: squared distances in units of the noise, and for every free parameter the logarithm of the number
+of observations. Errors of neighbouring places on an edge go together (a detector is drawn to one side by whatever is
+next to the edge), so an observation is a stretch of some pixels, however many points it was sampled with.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taichi_edges.edges.arcs import Arc, fit_arc, through_three
+from taichi_edges.edges.fitting import fit_chain, nearest_on_chain
+from taichi_edges.edges.ordering import Ordering
+from taichi_edges.shapes import Spline
+
+OUTLIER = 9.0  # squared noises that one observation can cost: three standard deviations
+PRICES = {"line": 6, "arc": 9, "circle": 6, "elliptic_arc": 10, "ellipse": 8}  # free parameters, with those of the ends
+CUBIC_PRICE, NEXT_CUBIC_PRICE = 12, 6  # of a cubic, and of one more in a smooth chain
+MOST_CUBICS = 4  # of an open chain
+LEAST_BEND = 1.0  # noises that the middle of an arc is off its chord, at least
+FIT_ROUNDS = 8
+
+
+@dataclass(frozen=True)
+class Yardstick:
+    """What counts as a difference. noise: of a place on an edge, across it. stretch: length of one observation.
+
+    Both in units of the unit cube.
+    """
+
+    noise: float
+    stretch: float
+
+
+@dataclass(frozen=True)
+class Track:
+    """Places along a stretch of edge, in order.
+
+    points: (n, 3). arc: (n,) arc length of each. share: (n,) length that each stands for. closed: back to the start?
+    """
+
+    points: np.ndarray
+    arc: np.ndarray
+    share: np.ndarray
+    closed: bool = False
+
+    @property
+    def ordering(self):
+        """The same as an Ordering."""
+        return Ordering(self.arc - self.arc[0], float(self.arc[-1] - self.arc[0]), self.closed)
+
+
+def price_of(shape):
+    """Number of free parameters of a shape, with its ends."""
+    if shape.kind == "spline":
+        return CUBIC_PRICE + NEXT_CUBIC_PRICE * (len(shape.curves) - 1)
+    return PRICES[shape.kind]
+
+
+def misfit(distances, share, yardstick):
+    """Sum over the observations of squared distances in units of the noise, each at most OUTLIER.
+
+    distances: (n,) of places. share: (n,) length that each stands for.
+    """
+    return float((share / yardstick.stretch) @ np.minimum((distances / yardstick.noise) ** 2, OUTLIER))
+
+
+def observations(share, yardstick):
+    """How many observations some places are, at least e (whose logarithm is 1)."""
+    return max(float(share.sum()) / yardstick.stretch, np.e)
+
+
+def best_shape(track, yardstick, count, worth=np.inf):
+    """The shape that describes a Track best, and its cost; None and infinity where none is cheaper than `worth`.
+
+    count: number of observations of all that is compared.
+    """
+    best, least = None, worth
+    for shape in candidates(track, yardstick):
+        price = price_of(shape) * np.log(count)
+        if price >= least:
+            continue
+        cost = price + misfit(distances_to(shape, track.points), track.share, yardstick)
+        if cost < least:
+            best, least = shape, cost
+    return best, least if best is not None else np.inf
+
+
+def candidates(track, yardstick):
+    """The shapes worth trying, the cheapest first."""
+    tolerance = 3.0 * yardstick.noise
+    line = fitted_line(track, tolerance)
+    if not track.closed:
+        yield line.shape()
+    bent = fitted_arc(track, tolerance, line)
+    if bent is not None:
+        yield bent.shape()
+    for cubics in range(4 if track.closed else 1, MOST_CUBICS + 1):
+        if len(track.points) < 6 * cubics:
+            break
+        curves, _ = fit_chain(track.points, track.ordering, tolerance, cubics)
+        yield Spline(curves, track.closed)
+
+
+def fitted_line(track, tolerance):
+    """The Arc of no bend through a Track."""
+    start = Arc(track.points.mean(axis=0), _unit(track.points[-1] - track.points[0]), np.zeros(3))
+    line = _settled(start, track, tolerance, straight=True)
+    return _spanning(line, track)
+
+
+def fitted_arc(track, tolerance, line):
+    """The Arc through a Track, or None where it is as good as straight."""
+    count = len(track.points)
+    start = through_three(*track.points[[0, count // 3, 2 * count // 3] if track.closed else [0, count // 2, -1]])
+    if start is None:
+        return None
+    arc = _settled(start, track, tolerance, straight=False)
+    if arc.curvature * line.length**2 / 8 < LEAST_BEND * tolerance / 3.0:
+        return None
+    return _spanning(arc, track)
+
+
+def _settled(arc, track, tolerance, straight):
+    """The Arc fitted to a Track, first with a wide tolerance."""
+    unused = np.broadcast_to(arc.tangent, track.points.shape)
+    for width in (4.0 * tolerance, tolerance):
+        arc = fit_arc(arc, track.points, unused, 0.0, width, straight, FIT_ROUNDS, track.share / track.share.max())
+    return arc
+
+
+def _spanning(arc, track):
+    """The Arc over the whole Track, whose ends tell how far it goes round."""
+    along = arc.coordinates(track.points)[0]
+    if arc.curvature == 0:
+        if along[-1] < along[0]:
+            arc, along = Arc(arc.origin, -arc.tangent, arc.bend), -along
+        return arc.over(along.min(), along.max())
+    middle = len(along) // 2
+    along = np.unwrap(along * arc.curvature) / arc.curvature
+    if along[-1] < along[0]:
+        arc, along = Arc(arc.origin, -arc.tangent, arc.bend), -along
+    low, high = along[0], along[-1]
+    assert low <= along[middle] + arc.round and high >= low
+    return arc.over(low, low + arc.round if track.closed else high)
+
+
+def distances_to(shape, points):
+    """(n,) distances of points to a shape, ends included."""
+    if shape.kind == "spline":
+        return nearest_on_chain(points, shape.curves)[0]
+    if shape.kind == "line":
+        along = shape.points[1] - shape.points[0]
+        share = np.clip((points - shape.points[0]) @ along / max(along @ along, 1e-300), 0, 1)
+        return np.linalg.norm(points - shape.at(share), axis=1)
+    return _distances_to_ellipse(shape, points)
+
+
+def _distances_to_ellipse(shape, points):
+    """(n,) distances of points to an EllipticArc: exact for a circle, by Newton's steps on the angle for an ellipse."""
+    offsets = points - shape.centre
+    x, y = (offsets @ axis / radius for axis, radius in zip(shape.axes, shape.radii, strict=True))
+    t = np.arctan2(y / shape.radii[1], x / shape.radii[0]) if shape.circular else np.arctan2(y, x)
+    a, b = shape.radii
+    for _ in range(0 if shape.circular else 5):
+        cosine, sine = np.cos(t), np.sin(t)
+        slope = (a * a - b * b) * sine * cosine - a * x * sine + b * y * cosine
+        bend = (a * a - b * b) * (cosine**2 - sine**2) - a * x * cosine - b * y * sine
+        t = t - np.where(np.abs(bend) > 1e-12, slope / np.minimum(bend, -1e-12), 0.0).clip(-0.3, 0.3)
+    middle = 0.5 * (shape.low + shape.high)
+    t = middle + (t - middle + np.pi) % (2 * np.pi) - np.pi
+    t = np.clip(t, shape.low, shape.high)
+    return np.linalg.norm(points - shape.at((t - shape.low) / (shape.high - shape.low)), axis=1)
+
+
+def track_of(shape, spacing):
+    """The Track of a shape, places at most `spacing` apart, at the middles of equal steps."""
+    count = max(int(np.ceil(shape.length / spacing)), 3)
+    fine = np.linspace(0, 1, 4 * count + 1)
+    points = shape.at(fine)
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    at = (np.arange(count) + 0.5) * arc[-1] / count
+    places = shape.at(np.interp(at, arc, fine))
+    return Track(places, at, np.full(count, arc[-1] / count), shape.closed)
+
+
+def _unit(vector):
+    """A vector of length 1."""
+    return vector / max(np.sqrt(vector @ vector), 1e-300)

@@ -1,0 +1,143 @@
+"""Samples of edges, who owns an edgel, and what the views say about edges."""
+
+import numpy as np
+import pytest
+from edgel_scenes import CylinderContour, arc, line, pixel_of, views_of
+
+from taichi_edges.edges.evidence import Claims, Samples, claims_of, spaced, support_along, support_of, supported
+from taichi_edges.kernels.edgel_matching import EdgelMatching
+from taichi_edges.shapes import EllipticArc, Line, Spline
+
+START, END = np.array([0.2, 0.3, 0.3]), np.array([0.8, 0.35, 0.4])
+A = line(START, END)
+RIM = arc([0.5, 0.5, 0.6], 0.25)
+CIRCLE = EllipticArc(np.array([0.5, 0.5, 0.6]), 0.25 * np.eye(3)[:2], 0.0, 2 * np.pi)
+
+
+@pytest.fixture
+def taichi(start_taichi):
+    start_taichi("f32", 2)
+
+
+def matching_of(curves, generator, **settings):
+    """EdgelMatching of views of curves."""
+    return EdgelMatching(views_of(curves, generator, **settings))
+
+
+def moved(shape, offset):
+    """A shape moved by (3,)."""
+    return shape.transformed(lambda points: points + offset)
+
+
+def test_samples_are_evenly_spaced():
+    ellipse = EllipticArc(np.zeros(3), np.diag([0.5, 0.1, 0])[:2], 0.1, 2.5)
+    uneven = Spline(np.array([[[0, 0, 0], [0.01, 0, 0], [0.02, 0, 0], [0.9, 0.5, 0]]]))
+    for shape in (Line(np.array([START, END])), CIRCLE, ellipse, uneven):
+        samples = Samples.along([shape], 0.005)
+        steps = np.linalg.norm(np.diff(samples.points, axis=0), axis=1)
+        # the spline hardly moves at its start: its speed doubles from one of the 64 chords to the next
+        assert np.ptp(steps) < 0.05 * steps.mean()
+        assert samples.lengths.sum() == pytest.approx(shape.length)
+    assert len(spaced(Line(np.array([START, START + 1e-6])), 0.005)) == 1
+    assert len(Samples.along([], 0.005)) == 0
+
+
+def test_sums_are_by_edge():
+    samples = Samples.along([Line(np.array([START, END])), CIRCLE], 0.01)
+    np.testing.assert_allclose(samples.sums(samples.lengths), [np.linalg.norm(END - START), CIRCLE.length])
+    assert samples.sums(samples.points).shape == (2, 3)
+
+
+def test_nearest_edge_owns_the_edgel():
+    claims = Claims.of(4, np.array([0, 0, 0, 2, 2]), np.array([1, 0, 1, 5, 3]), np.array([0.5, 0.2, 0.1, 0.3, 0.3]))
+    np.testing.assert_array_equal(claims.owners, [1, -1, 3, -1])
+    np.testing.assert_array_equal(claims.distances, [0.1, np.inf, 0.3, np.inf])
+    np.testing.assert_array_equal(claims.rivals, [0.2, np.inf, 0.3, np.inf])
+    np.testing.assert_array_equal(claims.beside(1), [0.2, np.inf, 0.3, np.inf])
+
+
+def test_true_edges_are_confirmed(taichi, generator):
+    shapes = [Line(np.array([START, END])), CIRCLE]
+    found = supported(matching_of([A, RIM], generator, noise_px=0.1), shapes)
+    for shape, evidence in zip(shapes, found, strict=True):
+        assert evidence.views == 24
+        assert evidence.supported_length == pytest.approx(shape.length, rel=0.02)
+        assert evidence.residual_px == pytest.approx(0.1, rel=0.2)
+        assert evidence.confidence > 0.99
+
+
+def test_noise_is_measured(taichi, generator):
+    for noise in (0.05, 0.3):
+        support = support_of(matching_of([A, RIM], generator, noise_px=noise), [Line(np.array([START, END])), CIRCLE])
+        assert 0.65 * noise < support.noise_px < 1.1 * noise  # a sample's edgel is the nearest of some
+
+
+def test_hidden_views_say_nothing_against_an_edge(taichi, generator):
+    half = matching_of([A, RIM], generator, noise_px=0.1, hidden=0.5)
+    found = supported(half, [Line(np.array([START, END])), CIRCLE])
+    assert all(evidence.confidence > 0.98 for evidence in found)
+
+
+def test_neighbour_does_not_support_an_edge(taichi, generator):
+    matching = matching_of([A], generator, noise_px=0.05)
+    true = Line(np.array([START, END]))
+    beside = moved(true, 0.6 * matching.pixel * np.array([0.0, 0.6, 0.8]))
+    alone, (owner, neighbour) = supported(matching, [beside])[0], supported(matching, [true, beside])
+    assert alone.supported_length > 0.8 * beside.length  # nobody else explains these edgels
+    assert owner.confidence > 0.99 and owner.supported_length > 0.95 * true.length
+    assert neighbour.supported_length < 0.1 * beside.length and neighbour.confidence < 0.1
+
+
+def test_two_close_parallel_edges_are_both_confirmed(taichi, generator):
+    apart = np.array([0.0, 0.0, 0.012])  # 2 px of these views
+    shapes = [Line(np.array([START, END])), Line(np.array([START, END]) + apart)]
+    matching = matching_of([A, line(START + apart, END + apart)], generator, noise_px=0.1)
+    assert 1.0 < 0.012 / matching.pixel < 3.0
+    assert all(evidence.confidence > 0.9 for evidence in supported(matching, shapes))
+
+
+def test_two_views_confirm_nothing(taichi, generator):
+    views = matching_of([A], generator, count=2)
+    found = supported(views, [Line(np.array([START, END]))])[0]
+    assert found.views == 2 and found.supported_length == 0 and found.confidence < 0.05
+
+
+def test_contour_is_not_sure(taichi, generator):
+    contour = CylinderContour([0.5, 0.5], 0.15, 0.2, 0.8)
+    seen = contour.seen_from(np.array([3.0, 0.5, 0.5]))(np.array([0.0, 1.0]))
+    found = supported(matching_of([contour, A], generator), [Line(seen), Line(np.array([START, END]))])
+    assert found[0].confidence < 0.3 < 0.98 < found[1].confidence
+
+
+def test_support_ends_where_the_edge_ends(taichi, generator):
+    matching = matching_of([A], generator, noise_px=0.05)
+    short = Line(A(np.array([0.2, 0.6])))
+    views = support_along(matching, short, np.array([-0.8, -0.3, 0.5, 1.5, 2.2]), claims_of(matching, [short]), own=0)
+    assert (views[1:4] > 20).all() and (views[[0, 4]] == 0).all()
+
+
+def test_what_others_own_supports_no_extension(taichi, generator):
+    matching = matching_of([A], generator, noise_px=0.05)
+    first, second = Line(A(np.array([0.0, 0.4]))), Line(A(np.array([0.6, 1.0])))
+    claims = claims_of(matching, [first, second])
+    views = support_along(matching, first, np.array([0.5, 1.25, 2.0]), claims, own=0)
+    assert views[0] > 20 and views[1] > 20 and views[2] < 8
+    assert support_along(matching, first, np.array([2.0]))[0] > 20
+
+
+def test_no_edges_and_no_edgels(taichi, generator):
+    assert supported(matching_of([A], generator), []) == []
+    none = supported(matching_of([], generator), [Line(np.array([START, END]))])[0]
+    assert (none.views, none.supported_length, none.residual_px, none.confidence) == (0, 0, 0, 0)
+
+
+def test_same_twice(taichi, generator):
+    matching = matching_of([A, RIM], generator, noise_px=0.2, hidden=0.3)
+    shapes = [Line(np.array([START, END])), CIRCLE, moved(CIRCLE, matching.pixel)]
+    assert supported(matching, shapes) == supported(matching, shapes)
+
+
+def test_samples_are_a_pixel_apart_at_most(taichi, generator):
+    views = views_of([A], generator)
+    samples = support_of(EdgelMatching(views), [CIRCLE]).samples
+    assert np.linalg.norm(np.diff(samples.points, axis=0), axis=1).max() < pixel_of(views)
