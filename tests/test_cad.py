@@ -12,7 +12,7 @@ from taichi_edges.edge_set import write_edges
 from taichi_edges.exporters.dxf import APPLICATION, layer_of, write_dxf
 from taichi_edges.exporters.nurbs import joined
 from taichi_edges.exporters.palette import KIND_COLOURS
-from taichi_edges.exporters.step import connected_parts, encoded, write_step
+from taichi_edges.exporters.step import connected_parts, encoded, prefix_for, write_step
 from taichi_edges.shapes import EllipticArc, Line, Spline
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.wireframe import Edge, Evidence, Wireframe, read_wireframe
@@ -67,16 +67,31 @@ def house():
     return Wireframe(vertices, tuple(edges), np.array([[4, 0]]))
 
 
-@pytest.fixture(params=["every shape", "large and far away", "house"])
+def cube():
+    """Eight vertices and twelve lines between them, of length 1, a little off."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    ends = [(a, b) for a in range(8) for b in range(a) if np.abs(corners[a] - corners[b]).sum() == 1]
+    vertices = corners + np.random.default_rng(0).normal(scale=1e-3, size=(8, 3))
+    return Wireframe(vertices, tuple(Edge(Line(vertices[list(e)]), e) for e in ends), np.zeros((0, 2), int))
+
+
+@pytest.fixture(params=["every shape", "large and far away", "house", "cube", "small cube"])
 def wireframe(request):
     if request.param == "house":
         return house()
+    if "cube" in request.param:
+        scale = 1.0 if request.param == "cube" else 1e-3
+        return cube().transformed(lambda points: scale * points, scale)
     every = Wireframe.loose(every_shape())
     return every if request.param == "every shape" else every.transformed(lambda points: 800 * points + 5000, 800.0)
 
 
 def size_of(wireframe):
     return max(np.abs(shape.cubics()).max() for shape in wireframe.shapes)
+
+
+def longest_side(wireframe):
+    return np.ptp(np.concatenate([shape.cubics().reshape(-1, 3) for shape in wireframe.shapes]), axis=0).max()
 
 
 def along(shape, knots):
@@ -215,6 +230,14 @@ def test_step_holds_every_edge_exactly(tmp_path, wireframe):
             np.testing.assert_array_equal(edge.placement[0], shape.centre)
 
 
+@pytest.mark.parametrize(
+    ("size", "prefix"),
+    [(1e-9, ".KILO."), (0.01, ".KILO."), (0.5, "$"), (99, "$"), (2000, ".MILLI."), (5e5, ".MICRO."), (1e99, ".MICRO.")],
+)
+def test_step_has_the_unit_that_makes_the_object_neither_tiny_nor_huge(size, prefix):
+    assert prefix_for(size) == prefix
+
+
 def test_step_edges_share_their_vertices_and_are_named(tmp_path):
     edges, sets = read_step(write_step(tmp_path / "edges.step", house()))
     meeting = [vertex for edge in edges for vertex in set(edge.vertices)]
@@ -256,7 +279,7 @@ def test_a_part_of_a_file_without_vertices_goes_through_both(tmp_path, name):
 
 
 def kernel_edges(path):
-    """[(name, TopoDS_Edge, its curve)] that OpenCASCADE reads, and its check of the whole."""
+    """[(name, TopoDS_Edge, its curve)] that OpenCASCADE reads, in order, and its check of the whole."""
     from OCP.BRepAdaptor import BRepAdaptor_Curve
     from OCP.BRepCheck import BRepCheck_Analyzer
     from OCP.IFSelect import IFSelect_RetDone
@@ -274,37 +297,47 @@ def kernel_edges(path):
         entity = reader.WS().TransferReader().EntityFromShapeResult(edge, 1)
         found.append((entity.Name().ToCString(), edge, BRepAdaptor_Curve(edge)))
         explorer.Next()
+    found.sort(key=lambda each: int(each[0].split(",")[0].rpartition("_")[2]))
     return found, BRepCheck_Analyzer(shape).IsValid()
 
 
-def kernel_knots(curve):
-    """(k,) the distinct knots of a B-spline in the kernel."""
-    spline = curve.BSpline()
-    return np.array([spline.Knot(number + 1) for number in range(spline.NbKnots())])
+def kernel_points(curve, shape, millimetres):
+    """Where the kernel's curve is, and where the shape is, both in millimetres."""
+    low, high = curve.FirstParameter(), curve.LastParameter()
+    if shape.kind == "spline":
+        spline = curve.BSpline()
+        parameters, expected = along(shape, np.array([spline.Knot(i + 1) for i in range(spline.NbKnots())]))
+    else:
+        fractions, expected = along(shape, None)
+        parameters = low + fractions * (high - low)
+    points = (curve.Value(parameter) for parameter in parameters)
+    return np.array([(point.X(), point.Y(), point.Z()) for point in points]), millimetres * expected
 
 
 def test_a_cad_kernel_reads_the_same_edges(tmp_path, wireframe):
     pytest.importorskip("OCP", reason="OpenCASCADE is not installed: pip install 'taichi_edges[cad]'")
+    from OCP.BRep import BRep_Tool
     from OCP.GCPnts import GCPnts_AbscissaPoint
     from OCP.GeomAbs import GeomAbs_BSplineCurve, GeomAbs_Circle, GeomAbs_Ellipse, GeomAbs_Line
     from OCP.TopExp import TopExp
 
     found, valid = kernel_edges(write_step(tmp_path / "edges.step", wireframe))
     assert valid and len(found) == len(wireframe)
-    found.sort(key=lambda each: int(each[0].split(",")[0].rpartition("_")[2]))
     kinds = {"line": GeomAbs_Line, "arc": GeomAbs_Circle, "circle": GeomAbs_Circle, "spline": GeomAbs_BSplineCurve}
+    millimetres = {"$": 1e3, ".MILLI.": 1.0, ".KILO.": 1e6}[prefix_for(longest_side(wireframe))]
+    limit = EXACT * millimetres * size_of(wireframe)
     vertices = {}
     for (name, body, curve), edge in zip(found, wireframe.edges, strict=True):
-        shape, size = edge.shape, size_of(wireframe)
+        shape = edge.shape
         assert name.startswith(f"{shape.kind}_") and curve.GetType() == kinds.get(shape.kind, GeomAbs_Ellipse)
-        low, high = curve.FirstParameter(), curve.LastParameter()
-        parameters, expected = along(shape, kernel_knots(curve) if shape.kind == "spline" else None)
-        points = [curve.Value(p if shape.kind == "spline" else low + p * (high - low)) for p in parameters]
-        points = np.array([(point.X(), point.Y(), point.Z()) for point in points])
-        np.testing.assert_allclose(points, expected, rtol=0, atol=EXACT * size)
+        np.testing.assert_allclose(*kernel_points(curve, shape, millimetres), rtol=0, atol=limit)
         # Ours is the sum of chords, short by 4e-5 of itself where there is one chord for a fortieth of a round.
-        assert GCPnts_AbscissaPoint.Length_s(curve, 1e-9 * size) == pytest.approx(shape.length, rel=1e-4)
+        assert GCPnts_AbscissaPoint.Length_s(curve, limit) == pytest.approx(millimetres * shape.length, rel=1e-4)
         if shape.kind in ("arc", "circle"):
-            assert curve.Circle().Radius() == pytest.approx(shape.radii[0], rel=1e-12)
+            assert curve.Circle().Radius() == pytest.approx(millimetres * shape.radii[0], rel=1e-12)
         for end, of in zip(edge.vertices, (TopExp.FirstVertex_s, TopExp.LastVertex_s), strict=False):
-            assert of(body, True).IsSame(vertices.setdefault(end, of(body, True)))
+            vertex = of(body, False)
+            assert vertex.IsSame(vertices.setdefault(end, vertex))  # edges that meet share it
+            assert BRep_Tool.Tolerance_s(vertex) <= 1e-6 * millimetres * longest_side(wireframe)
+    different = list(vertices.values())
+    assert not any(a.IsSame(b) for number, a in enumerate(different) for b in different[:number])
