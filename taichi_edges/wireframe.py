@@ -93,6 +93,17 @@ class Wireframe:
             np.array([number for number, cubics in curves for _ in cubics], dtype=np.int64),
         )
 
+    def keep(self, chosen):
+        """Only the chosen edges, (E,) bool, and the vertices that these end in."""
+        kept = np.flatnonzero(chosen)
+        used = np.unique([end for number in kept for end in self.edges[number].vertices]).astype(np.int64)
+        vertex, edge = np.full(len(self.vertices), -1), np.full(len(self.edges), -1)
+        vertex[used], edge[kept] = np.arange(len(used)), np.arange(len(kept))
+        edges = (self.edges[number] for number in kept)
+        edges = tuple(replace(old, vertices=tuple(int(vertex[end]) for end in old.vertices)) for old in edges)
+        contacts = np.stack([vertex[self.contacts[:, 0]], edge[self.contacts[:, 1]]], axis=1)
+        return Wireframe(self.vertices[used], edges, contacts[(contacts >= 0).all(axis=1)])
+
     def transformed(self, function, scale):
         """The same wireframe with `function`, a similarity (n, 3) -> (n, 3), applied. scale: by which lengths grow."""
         edges = []

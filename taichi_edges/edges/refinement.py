@@ -1,8 +1,12 @@
 """From single edges to a wireframe: connected, minimal, in agreement with the images."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
+
+from taichi_edges.edges.adjustment import adjusted
+from taichi_edges.edges.completion import completed
 from taichi_edges.edges.continuation import Merging, continued
 from taichi_edges.edges.evidence import claims_of, support_along, supported
 from taichi_edges.edges.extents import extended
@@ -18,11 +22,13 @@ LEAST_SUPPORTED = 0.5  # of the length of an edge
 
 @dataclass(frozen=True)
 class RefineCounts:
-    """What the refinement did: circles completed, strokes joined to others, and what was left out."""
+    """What the refinement did: circles completed, strokes joined to others, lines added between
+    vertices, and what was left out."""
 
     circles: int = 0
     joined: int = 0
     duplicates: int = 0
+    lines: int = 0
     unsupported: int = 0
 
 
@@ -39,9 +45,19 @@ def refine_wireframe(loose, views, config):
     shapes, first = continued(loose.shapes, yardstick, pixel, seen)
     kept = with_support(matching, shapes)
     shapes, second = continued(with_longer_ends(matching, kept), yardstick, pixel, seen, WIDE_GAP_PX)
-    wireframe = connected(with_support(matching, shapes), pixel)
+    wireframe, lines = completed(connected(with_support(matching, shapes), pixel), matching)
+    wireframe = adjusted(wireframe, matching)
+    judged = with_evidence(wireframe, matching)
     counts = [getattr(first, name) + getattr(second, name) for name in Merging.__dataclass_fields__]
-    return wireframe, RefineCounts(*counts, len(shapes) - len(wireframe))
+    return judged, RefineCounts(*counts, lines, len(shapes) + lines - len(judged))
+
+
+def with_evidence(wireframe, matching):
+    """The Wireframe with what the images say about each edge, without those they do not support."""
+    found = supported(matching, wireframe.shapes)
+    edges = [replace(edge, evidence=of) for edge, of in zip(wireframe.edges, found, strict=True)]
+    kept = [edge.evidence.supported_length >= LEAST_SUPPORTED * edge.shape.length for edge in edges]
+    return replace(wireframe, edges=tuple(edges)).keep(np.array(kept, dtype=bool))
 
 
 def with_support(matching, shapes):
