@@ -7,9 +7,9 @@ from taichi_edges.bezier import evaluate_bezier
 from taichi_edges.synthetic.free_form import hyperbola_cubics, nut_side
 from taichi_edges.synthetic.hard_parts import HARD_PARTS, PIXEL
 from taichi_edges.synthetic.profiles import CHORD_ERROR
-from taichi_edges.synthetic.rendering import pixel_size, ring_cameras
+from taichi_edges.synthetic.rendering import camera_centre, pixel_size, ring_cameras
 from taichi_edges.synthetic.solids import LONGEST_SIDE
-from taichi_edges.synthetic.visibility import sample_contours
+from taichi_edges.synthetic.visibility import ray_scene, sample_contours, sample_edges, visible_from
 
 ARC_ERROR = 4.2e-6  # of the radius, of an arc's cubics
 
@@ -63,6 +63,14 @@ def test_edges_are_inside_the_cube(parts, name):
     points = np.concatenate([points for points, _ in curves_of(parts[name])] + [parts[name].edges.lines.reshape(-1, 3)])
     margin = (1.0 - LONGEST_SIDE) / 2.0 - 2 * ARC_ERROR
     assert points.min() > margin and points.max() < 1.0 - margin
+
+
+@pytest.mark.parametrize("name", HARD_PARTS)
+def test_all_of_every_edge_is_seen_from_two_places(parts, name):
+    scene, samples = ray_scene(parts[name]), sample_edges(parts[name], 0.01)
+    _, poses = ring_cameras(30, 400)
+    seen = np.sum([visible_from(scene, samples, camera_centre(pose)) for pose in poses], axis=0)
+    assert seen.min() >= 2  # or nobody could recover it
 
 
 def test_a_pixel_is_as_large_as_the_drawings_say(parts):

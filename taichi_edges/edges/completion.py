@@ -4,8 +4,6 @@ Points are thinned out and clustered, and an edge of a few pixels has hardly any
 the other edges that meet there, nothing is left to guess: the edgels between them, which no other edge owns, decide.
 """
 
-from functools import partial
-
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -18,6 +16,8 @@ LONGEST_PX = 60.0  # a longer edge has points of its own
 SHORTEST_PX = 4.0
 CLEAR_PX = 2.0  # next to a vertex the edgels are those of the others
 SHOWN = 0.9  # of the places between, in LEAST_VIEWS views
+ON_PX, ABOUT_PX = 0.5, 3.0  # from a line: on it, about it
+STEADY = 0.6  # a contour that passes by at random lies on the line a sixth of the time
 MOST_PAIRS = 20_000  # the nearest ones, so that a large scene does not take long
 
 
@@ -26,17 +26,28 @@ def completed(wireframe, matching):
     pairs = open_pairs(wireframe, matching.pixel)
     if not len(pairs):
         return wireframe, 0
-    seen = partial(support_along, matching, claims=claims_of(matching, wireframe.shapes))
-    found = []
+    claims, found = claims_of(matching, wireframe.shapes), []
     for first, second in pairs.tolist():
         line = Line(wireframe.vertices[[first, second]])
-        views = seen(line, clear_places(line, matching.pixel))
-        if (views >= LEAST_VIEWS).mean() >= SHOWN:
+        places = clear_places(line, matching.pixel)
+        views = support_along(matching, line, places, claims)
+        if (views >= LEAST_VIEWS).mean() >= SHOWN and steadiness(matching, line, places, claims) >= STEADY:
             found.append((float(views.mean()), first, second))
     edges = list(wireframe.edges)
     for _, first, second in sorted(found, reverse=True):
         edges.append(Edge(Line(wireframe.vertices[[first, second]]), (first, second)))
     return Wireframe(wireframe.vertices, tuple(edges), wireframe.contacts), len(found)
+
+
+def steadiness(matching, line, places, claims):
+    """Share of the edgels about a line, of those that nothing else explains, that lie on it.
+
+    A chord across a rounded corner is followed by the occluding contour in some views, and missed by it in others.
+    """
+    views = slice(0, matching.edgels.view_count)
+    edgels, residuals, _ = matching.matches(line.at(places), line.tangents(places), views, ABOUT_PX)
+    free = np.append(claims.owners < 0, False)[edgels]
+    return (free & (np.abs(residuals) <= ON_PX)).sum() / max(free.sum(), 1)
 
 
 def open_pairs(wireframe, pixel):

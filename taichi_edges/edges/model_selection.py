@@ -12,13 +12,15 @@ import numpy as np
 from taichi_edges.edges.arcs import Arc, fit_arc, through_three
 from taichi_edges.edges.fitting import fit_chain, nearest_on_chain
 from taichi_edges.edges.ordering import Ordering
-from taichi_edges.shapes import Spline
+from taichi_edges.shapes import EllipticArc, Spline
 
 OUTLIER = 9.0  # squared noises that one observation can cost: three standard deviations
 PRICES = {"line": 6, "arc": 9, "circle": 6, "elliptic_arc": 10, "ellipse": 8}  # free parameters, with those of the ends
 CUBIC_PRICE, NEXT_CUBIC_PRICE = 12, 6  # of a cubic, and of one more in a smooth chain
 MOST_CUBICS = 4  # of an open chain
 LEAST_BEND = 1.0  # noises that the middle of an arc is off its chord, at least
+LEAST_FLATNESS = 0.05  # of an ellipse: the shorter axis over the longer one
+LEAST_ROUND = np.radians(45.0)  # of an ellipse, to be told from other curves
 FIT_ROUNDS = 8
 
 
@@ -96,6 +98,9 @@ def candidates(track, yardstick):
     bent = fitted_arc(track, tolerance, line)
     if bent is not None:
         yield bent.shape()
+        ellipse = fitted_ellipse(track)
+        if ellipse is not None:
+            yield ellipse
     for cubics in range(4 if track.closed else 1, MOST_CUBICS + 1):
         if len(track.points) < 6 * cubics:
             break
@@ -122,6 +127,42 @@ def fitted_arc(track, tolerance, line):
     return _spanning(arc, track)
 
 
+def fitted_ellipse(track):
+    """The EllipticArc through a Track, or None where there is no ellipse, or hardly any of it.
+
+    Least squares of the conic in the plane of the track (Fitzgibbon, Pilu, Fisher 1999, in OpenCV).
+    """
+    import cv2
+
+    centre = track.points.mean(axis=0)
+    _, spread, axes = np.linalg.svd(track.points - centre, full_matrices=False)
+    if len(track.points) < 6 or spread[1] <= 0:
+        return None
+    flat = (track.points - centre) @ axes[:2].T / spread[0]
+    (x, y), (width, height), turn = cv2.fitEllipseDirect(flat.astype(np.float32))
+    if not np.isfinite([x, y, width, height]).all() or min(width, height) < LEAST_FLATNESS * max(width, height):
+        return None
+    cosine, sine = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    halves = 0.5 * spread[0] * np.array([[width * cosine, width * sine], [-height * sine, height * cosine]]) @ axes[:2]
+    ellipse = EllipticArc.conjugate(centre + spread[0] * np.array([x, y]) @ axes[:2], halves, 0.0, 2 * np.pi)
+    return None if ellipse.circular else _round_ellipse(ellipse, track)
+
+
+def _round_ellipse(ellipse, track):
+    """A whole ellipse, cut to the Track along it, in whose direction it goes; None where that is less than a part."""
+    offsets = track.points - ellipse.centre
+    t = np.unwrap(np.arctan2(*(offsets @ ellipse.axes[k] / ellipse.radii[k] ** 2 for k in (1, 0))))
+    if t[-1] < t[0]:
+        ellipse = EllipticArc(ellipse.centre, ellipse.axes * np.array([[1.0], [-1.0]]), 0.0, 2 * np.pi)
+        t = -t
+    if track.closed:
+        return ellipse.over(t[0], t[0] + 2 * np.pi)
+    before, after = 0.5 * (t[1] - t[0]), 0.5 * (t[-1] - t[-2])  # the places are the middles of what they stand for
+    return (
+        ellipse.over(t[0] - before, t[-1] + after) if LEAST_ROUND < t[-1] - t[0] + before + after < 2 * np.pi else None
+    )
+
+
 def _settled(arc, track, tolerance, straight):
     """The Arc fitted to a Track, first with a wide tolerance."""
     unused = np.broadcast_to(arc.tangent, track.points.shape)
@@ -131,19 +172,16 @@ def _settled(arc, track, tolerance, straight):
 
 
 def _spanning(arc, track):
-    """The Arc over the whole Track, whose ends tell how far it goes round."""
+    """The Arc over the whole Track, whose places are the middles of what they stand for."""
     along = arc.coordinates(track.points)[0]
-    if arc.curvature == 0:
-        if along[-1] < along[0]:
-            arc, along = Arc(arc.origin, -arc.tangent, arc.bend), -along
-        return arc.over(along.min(), along.max())
-    middle = len(along) // 2
-    along = np.unwrap(along * arc.curvature) / arc.curvature
+    if arc.curvature > 0:
+        along = np.unwrap(along * arc.curvature) / arc.curvature
     if along[-1] < along[0]:
         arc, along = Arc(arc.origin, -arc.tangent, arc.bend), -along
-    low, high = along[0], along[-1]
-    assert low <= along[middle] + arc.round and high >= low
-    return arc.over(low, low + arc.round if track.closed else high)
+    if arc.curvature == 0:
+        along = np.array([along.min(), along.max()])
+    low, high = along[0] - 0.5 * track.share[0], along[-1] + 0.5 * track.share[-1]
+    return arc.over(low, low + arc.round if track.closed else min(high, low + arc.round))
 
 
 def distances_to(shape, points):
