@@ -26,6 +26,7 @@ PARALLEL = np.cos(np.radians(20.0))
 JOINT_COSINE = np.cos(np.radians(25.0))  # between the tangents of two strokes that continue each other
 JOINT_GAP_PX = 12.0  # between their ends, along; a tail or a gap at a touching edge is as long
 JOINT_ASIDE = 0.25  # of that gap: how far aside the other end may lie, beyond BESIDE
+SPACING_PX = 2.0  # of the places by which strokes are compared
 LONGEST_RUN = 8  # strokes that may become one at once
 FOLLOWED = 0.5  # of the places of a stroke that the shape which replaces it runs along, at least
 CHORDS = 512  # of a shape, for its tangents
@@ -114,7 +115,7 @@ def goes_on(shape, places, pixel, seen, least=0.0):
     """
     count = max(int(np.ceil(shape.length / pixel)), 8)
     parameters = (np.arange(count) + 0.5) / count
-    covered = cKDTree(places).query(shape.at(parameters))[0] <= 1.5 * pixel
+    covered = cKDTree(places).query(shape.at(parameters))[0] <= SPACING_PX * pixel
     if covered.all() or covered.mean() < least:
         return bool(covered.all())
     views = seen(shape, parameters)
@@ -200,7 +201,7 @@ def cut_anew(shapes, path, yardstick, pixel, seen):
     """The shapes that describe a path with the least cost (BIC), each over a run of its strokes."""
     if len(path) == 1:
         return [shapes[path[0][0]]]
-    tracks = [oriented(track_of(shapes[number], pixel), backward) for number, backward in path]
+    tracks = [oriented(track_of(shapes[number], SPACING_PX * pixel), backward) for number, backward in path]
     count = observations(np.concatenate([track.share for track in tracks]), yardstick)
     least, choice = [0.0], []
     for last, (number, _) in enumerate(path):

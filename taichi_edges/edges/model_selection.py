@@ -22,7 +22,8 @@ MOST_CUBICS = 4  # of an open chain
 LEAST_BEND = 1.0  # noises that the middle of an arc is off its chord, at least
 LEAST_FLATNESS = 0.05  # of an ellipse: the shorter axis over the longer one
 LEAST_ROUND = np.radians(45.0)  # of an ellipse, to be told from other curves
-FIT_ROUNDS = 8
+FIT_ROUNDS = 4
+FEWEST_PLACES = 8  # on a shape, however short it is
 
 
 @dataclass(frozen=True)
@@ -221,7 +222,7 @@ def _distances_to_ellipse(shape, points):
 
 def track_of(shape, spacing):
     """The Track of a shape, places at most `spacing` apart, at the middles of equal steps."""
-    count = max(int(np.ceil(shape.length / spacing)), 3)
+    count = max(int(np.ceil(shape.length / spacing)), FEWEST_PLACES)
     fine = np.linspace(0, 1, 4 * count + 1)
     points = shape.at(fine)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
