@@ -13,6 +13,7 @@ line_sources, curve_sources
 """
 
 from dataclasses import asdict, dataclass, replace
+from operator import index
 
 import numpy as np
 
@@ -141,8 +142,9 @@ def read_wireframe(path):
         problem = f"its vertices, edges and contacts are no wireframe ({type(error).__name__}: {error})"
         raise UserError(f"{path}: {problem}; run the refine stage again") from error
     named = [*(end for edge in found for end in edge.vertices), *contacts[:, 0]]
-    if any(not 0 <= end < len(vertices) for end in named) or (contacts[:, 1] >= len(found)).any():
-        raise UserError(f"{path}: its edges name vertices that are not there; run the refine stage again")
+    touched = contacts[:, 1].tolist()
+    if any(not 0 <= end < len(vertices) for end in named) or any(not 0 <= edge < len(found) for edge in touched):
+        raise UserError(f"{path}: it names vertices or edges that are not there; run the refine stage again")
     return Wireframe(vertices, found, contacts), content
 
 
@@ -158,18 +160,28 @@ def _described(edge):
 
 
 def _undescribed(number, described, edges):
-    """The Edge of JSON values; `edges` is the EdgeSet that holds its points."""
-    kind, evidence = described["kind"], None
+    """The Edge of JSON values; `edges` is the EdgeSet that holds its points. ValueError and others if it is none."""
+    evidence, vertices = None, tuple(index(end) for end in described["vertices"])
     if "confidence" in described:
-        evidence = Evidence(*(described[key] for key in Evidence.__dataclass_fields__))
+        views, *rest = (described[key] for key in Evidence.__dataclass_fields__)
+        evidence = Evidence(index(views), *map(float, rest))
+    shape = _shape_of(number, described, edges)
+    if len(vertices) != (0 if shape.closed else 2):
+        raise ValueError(f"edge {number} of kind {described['kind']} ends in {len(vertices)} vertices")
+    return Edge(shape, vertices, evidence)
+
+
+def _shape_of(number, described, edges):
+    """The shape of an edge of which all is given as JSON values, except the points in `edges`."""
     if "half_axes" in described:
         centre, axes = (np.array(described[key], dtype=np.float64) for key in ("centre", "half_axes"))
-        shape = EllipticArc(centre, axes.reshape(2, 3), *described["angles_rad"])
-    elif kind == "line":
-        shape = Line(edges.lines[edges.line_sources == number][0])
-    else:
-        shape = Spline(edges.curves[edges.curve_sources == number], bool(described["closed"]))
-    return Edge(shape, tuple(described["vertices"]), evidence)
+        return EllipticArc(centre.reshape(3), axes.reshape(2, 3), *map(float, described["angles_rad"]))
+    if described["kind"] == "line":
+        return Line(edges.lines[edges.line_sources == number][0])
+    curves = edges.curves[edges.curve_sources == number]
+    if not len(curves):
+        raise ValueError(f"edge {number} has no points")
+    return Spline(curves, bool(described["closed"]))
 
 
 def _shapes_of_sources(edges):
