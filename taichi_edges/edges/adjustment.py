@@ -29,6 +29,7 @@ from taichi_edges.wireframe import Wireframe
 RADII_PX = (3.0, 2.0, 1.5, 1.0, 1.0)  # of the edgels that are looked at, round by round
 CORRELATED_PX = 40.0  # along an edge: pixels that count as one observation; 20 to 55 in images and in learned maps
 LEAST_NOISE_PX = 0.05  # of the edgels; the best detector's
+TIGHT_RADIUS_PX, SCALE_NOISES = 1.0, 3.0  # so near to the edgels their noise says which of them are the edge's
 START_PX = 1.0  # standard deviation of the edges that are given
 END_PX, MOST_ENDS = 3.0, 0.25  # edgels so near to an end say nothing; at most so much of the length at either end
 PIN_PX, CONTACT_PX = (
@@ -160,8 +161,9 @@ def image_equations(problem, wireframe, matching, radius):
     shapes, pixel = wireframe.shapes, problem.pixel
     support = support_of(matching, shapes, radius)
     samples = support.samples
-    said = matching.equations_of(samples.points, support.edgels, SCALE_PX).astype(np.float64)
     noise = max(support.noise_px, LEAST_NOISE_PX)
+    scale = SCALE_PX if radius > TIGHT_RADIUS_PX else min(SCALE_PX, SCALE_NOISES * noise)
+    said = matching.equations_of(samples.points, support.edgels, scale).astype(np.float64)
     counted = _counted(wireframe, samples, pixel) * support.certainty  # what agrees by chance says nothing
     said *= (counted * SPACING_PX / CORRELATED_PX / noise**2)[:, None]
     planes, pulls = _across(said, samples.directions)
