@@ -50,13 +50,15 @@ class Constraint:
     """Something that edges are to each other. hard: it is exact in the end.
 
     edges: indices of these edges, each once. values: function of their shapes, in this order -> (m,), 0 where it holds.
-    deviation: standard deviation of the values.
+    deviation: standard deviation of the values. about: function of a shape; where there is one, `values` is of what it
+    gives, which is found but once for all constraints.
     """
 
     edges: tuple
     values: object
     deviation: float
     hard: bool = False
+    about: object = None
 
 
 @dataclass(frozen=True)
@@ -297,22 +299,31 @@ def with_vertices(wireframe, vertices):
 
 
 def constrained(layout, wireframe, constraints, hard=None):
-    """Equations of the constraints at a Wireframe. hard: weight of their values in place of their own deviations."""
-    equations, shapes, pairs = Equations(layout.size), wireframe.shapes, {}
+    """Equations of the constraints at a Wireframe. hard: by how much more they weigh than their deviations say."""
+    equations, described = Equations(layout.size), {}
     for constraint in constraints:
-        slopes, edges = [], [shapes[number] for number in constraint.edges]
-        for place, number in enumerate(constraint.edges):
-            pairs[number] = pairs.get(number) or neighbors_of(wireframe, number)
-            slopes.append(derivatives(pairs[number], partial(_replaced, constraint.values, edges, place)))
+        for number in constraint.edges:
+            if (number, constraint.about) not in described:
+                described[number, constraint.about] = _described(wireframe, number, constraint.about)
+        here, nearby = zip(*(described[number, constraint.about] for number in constraint.edges), strict=True)
+        slopes = []
+        for place, pairs in enumerate(nearby):
+            slopes.append(derivatives(pairs, partial(_replaced, constraint.values, here, place)))
         unknowns = np.concatenate([layout.columns[number] for number in constraint.edges])
         weight = 1.0 / constraint.deviation**2 * (hard or 1.0)
-        equations.add(unknowns, constraint.values(*edges), np.concatenate(slopes, axis=-1), weight)
+        equations.add(unknowns, constraint.values(*here), np.concatenate(slopes, axis=-1), weight)
     return equations
 
 
-def _replaced(values, shapes, place, shape):
-    """Values of some shapes, of which one has been replaced."""
-    return values(*shapes[:place], shape, *shapes[place + 1 :])
+def _described(wireframe, number, about):
+    """An edge's shape and its neighbors, or what `about` gives of each."""
+    shape, pairs = wireframe.edges[number].shape, neighbors_of(wireframe, number)
+    return (about(shape), [(about(one), about(other)) for one, other in pairs]) if about else (shape, pairs)
+
+
+def _replaced(values, arguments, place, argument):
+    """Values of some arguments, of which one has been replaced."""
+    return values(*arguments[:place], argument, *arguments[place + 1 :])
 
 
 def smooth_joints(wireframe):

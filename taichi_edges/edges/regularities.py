@@ -28,7 +28,7 @@ from taichi_edges.edges.adjustment import (
     smooth_joints,
 )
 from taichi_edges.edges.arcs import cross
-from taichi_edges.edges.charts import derivatives
+from taichi_edges.edges.charts import STEP, derivatives
 from taichi_edges.edges.evidence import SPACING_PX, support_of
 
 KINDS = ("parallel", "perpendicular", "equal_radius", "coaxial", "coplanar")
@@ -49,7 +49,8 @@ def features(shape):
     if shape.kind == "line":
         return np.concatenate([shape.tangents(0.5), shape.at(0.5), [0.0]])
     radius = shape.radii.mean() if shape.circular else 0.0
-    return np.concatenate([shape.normal, shape.centre, [radius]])
+    normal = cross(*shape.axes)
+    return np.concatenate([normal / np.sqrt(normal @ normal), shape.centre, [radius]])
 
 
 @dataclass(frozen=True)
@@ -62,10 +63,7 @@ class Relation:
 
     def constraint(self):
         """The Constraint that makes it hold."""
-        return Constraint(self.edges, self._of_shapes, DEVIATION, hard=True)
-
-    def _of_shapes(self, *shapes):
-        return self.values(*map(features, shapes))
+        return Constraint(self.edges, self.values, DEVIATION, hard=True, about=features)
 
 
 def regularised(wireframe, matching):
@@ -87,6 +85,8 @@ def regularised(wireframe, matching):
             break
         relations = [relation for relation in relations if not risen & set(relation.edges)]
         regular = wireframe
+    else:
+        relations = []
     lost = Counter(relation.kind for relation in imposed) - Counter(relation.kind for relation in relations)
     kept = Counter(relation.kind for relation in relations)
     return regular, {kind: (found[kind] - lost[kind], kept[kind]) for kind in KINDS}
@@ -97,14 +97,22 @@ def found_relations(wireframe, matching):
     counts, imposed = Counter(), []
     judge = Judge.of(wireframe, matching)
     for kind in KINDS:
-        candidates = [(judge.rise(relation), relation) for relation in CANDIDATES[kind](wireframe, matching.pixel)]
-        for _, relation in sorted(candidates, key=lambda pair: pair[0]):
-            rise = judge.rise(relation)
-            if rise <= judge.allowed:
+        candidates = [(relation, judge.linear(relation)) for relation in CANDIDATES[kind](wireframe, matching.pixel)]
+        for relation, linear in sorted(candidates, key=lambda pair: judge.rise(pair[1])):
+            if judge.rise(linear) <= judge.allowed:
                 counts[kind] += 1
-                if judge.impose(relation):
+                if judge.impose(linear):
                     imposed.append(relation)
     return counts, imposed
+
+
+@dataclass(frozen=True)
+class Linear:
+    """values: (m,) of a relation. slopes: (m, k) their derivatives by (k,) `unknowns`, each once."""
+
+    values: np.ndarray
+    slopes: np.ndarray
+    unknowns: np.ndarray
 
 
 class Judge:
@@ -138,43 +146,46 @@ class Judge:
                 self.features[number] = features(shape)
                 self.slopes[number] = derivatives(neighbors_of(wireframe, number), features)
 
-    def rise(self, relation):
-        """Rise of the sum of squares for each unknown that a relation takes away; 0 where it is implied."""
-        values, slopes, unknowns = self._linear(relation)
-        powers, axes = np.linalg.eigh(slopes @ self.covariance[np.ix_(unknowns, unknowns)] @ slopes.T)
-        off, free = axes.T @ values, powers > IMPLIED**2
-        if (np.abs(off[~free]) > CLOSE).any():
-            return np.inf
-        return float((off[free] ** 2 / powers[free]).sum() / max(free.sum(), 1))
-
-    def impose(self, relation):
-        """Take a relation for granted. Returns whether it was not implied already."""
-        values, slopes, unknowns = self._linear(relation)
-        reach = self.covariance[:, unknowns] @ slopes.T  # (size, m)
-        powers, axes = np.linalg.eigh(slopes @ reach[unknowns])
-        free = powers > IMPLIED**2
-        gain = reach @ (axes[:, free] / powers[free])
-        self.shift -= gain @ (axes[:, free].T @ values)
-        self.covariance -= gain @ (reach @ axes[:, free]).T
-        return bool(free.any())
-
-    def _linear(self, relation):
-        """Values (m,) of a relation, their derivatives (m, k), and the (k,) unknowns these are by."""
+    def linear(self, relation):
+        """A relation as a Linear one, at the wireframe as it was given."""
         given = np.concatenate([self.features[number] for number in relation.edges])
         pieces = len(relation.edges)
 
         def values(step):
             return relation.values(*(given + step).reshape(pieces, -1))
 
-        by_features = np.stack([(values(s) - values(-s)) / 2e-6 for s in 1e-6 * np.eye(len(given))], axis=1)
-        blocks = np.split(by_features, pieces, axis=1)
-        pairs = zip(blocks, relation.edges, strict=True)
-        slopes = np.concatenate([block @ self.slopes[number] for block, number in pairs], axis=1)
+        by_features = np.stack([(values(s) - values(-s)) / (2 * STEP) for s in STEP * np.eye(len(given))], axis=1)
+        blocks = zip(np.split(by_features, pieces, axis=1), relation.edges, strict=True)
+        slopes = np.concatenate([block @ self.slopes[number] for block, number in blocks], axis=1)
         unknowns = np.concatenate([self.columns[number] for number in relation.edges])
-        moved = np.unique(unknowns)  # edges that share a vertex share unknowns
-        gathered = np.zeros((len(slopes), len(moved)))
-        np.add.at(gathered.T, np.searchsorted(moved, unknowns), slopes.T)
-        return values(0.0) + gathered @ self.shift[moved], gathered, moved
+        each = np.unique(unknowns)  # edges that share a vertex share unknowns
+        summed = np.zeros((len(slopes), len(each)))
+        np.add.at(summed.T, np.searchsorted(each, unknowns), slopes.T)
+        return Linear(values(0.0), summed, each)
+
+    def rise(self, linear):
+        """Rise of the sum of squares for each unknown that a relation takes away; 0 where it is implied."""
+        off, powers, free, _, _ = self._axes(linear)
+        if (np.abs(off[~free]) > CLOSE).any():
+            return np.inf
+        return float((off[free] ** 2 / powers[free]).sum() / max(free.sum(), 1))
+
+    def impose(self, linear):
+        """Take a relation for granted. Returns whether it was not implied already."""
+        off, powers, free, axes, reach = self._axes(linear)
+        gain = reach @ (axes[:, free] / powers[free])
+        self.shift -= gain @ off[free]
+        self.covariance -= gain @ (reach @ axes[:, free]).T
+        return bool(free.any())
+
+    def _axes(self, linear):
+        """The values on their principal axes, variances there, whether these are more than 0, the axes (m, m); and
+        covariances (size, m) of all unknowns with the values.
+        """
+        reach = self.covariance[:, linear.unknowns] @ linear.slopes.T
+        powers, axes = np.linalg.eigh(linear.slopes @ reach[linear.unknowns])
+        off = axes.T @ (linear.values + linear.slopes @ self.shift[linear.unknowns])
+        return off, powers, powers > IMPLIED**2, axes, reach
 
 
 def _risen(before, after, relations):
