@@ -33,6 +33,15 @@ class Explained:
     steadiness: np.ndarray
     noise_px: float
 
+    @property
+    def tight_px(self):
+        """Residual up to which an edgel lies on an edge."""
+        return max(TIGHT_PX, TIGHT_NOISES * self.noise_px)
+
+    def keep(self, chosen):
+        """What is said about the chosen points only. chosen: (n,) bool or indices."""
+        return Explained(self.support[chosen], self.steadiness[chosen], self.noise_px)
+
 
 def explain(matching, refined):
     """Explained for `RefinedPoints`. matching: EdgelMatching.
