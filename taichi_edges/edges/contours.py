@@ -8,6 +8,7 @@ at most sqrt(2 / (NEAR + 1)) = 0.53 of its way through a window within 1 / NEAR 
 
 What is independent are the views, not the edgels beside each other in one view. The share is tested by a likelihood
 ratio: a line that few views see must be the steadier, and one whose edgels others explain has no evidence at all.
+From similar directions even a contour looks steady: a line must be seen from directions LEAST_ANGLE apart.
 """
 
 from dataclasses import dataclass
@@ -19,7 +20,12 @@ from taichi_edges.edges.clustering import members_of_clusters
 NEAR = 6.0  # an edgel is near a line within so many times the distance at which it is on it
 OWNED_PX = 1.0  # an edge explains the edgels so near to it
 CONTOUR_SHARE = 0.45  # of a contour's edgels near a line that lie on it; those of pipes and blades: 0.3 .. 0.55
+CHANCE_SHARE = 0.38  # the same where no single contour can be what is seen, only edgels that happen to be near
 ROUNDS = 2  # what is no edge is looked at again when all edges have taken their edgels
+# Over the angle to either side of their mean a contour moves by half the radius times its square: from directions nearer
+# to each other than this, one of 15 pixels stays within the half pixel in which edgels are on a line.
+LEAST_ANGLE = np.radians(15.0)
+WIDE_ANGLE = np.radians(45.0)  # seen over so much to either side, only a contour of 5 pixels stays near
 LEAST_DOUBT = 1e-6  # of a share, from 0 and 1
 
 
@@ -76,26 +82,27 @@ def steady_edges(matching, points, directions, labels, explained, least):
     clusters = members_of_clusters(labels)
     sightings = Sightings.of(matching, points, directions, explained.tight_px)
     order = np.argsort([-explained.support[members].mean() for members in clusters], kind="stable")
+    spread = np.array([np.median(explained.spread[members]) for members in clusters])  # squared sines
+    order = order[spread[order] >= np.sin(LEAST_ANGLE) ** 2]
+    usual = np.where(spread >= np.sin(WIDE_ANGLE) ** 2, CHANCE_SHARE, CONTOUR_SHARE)
     free, edges = np.ones(len(matching.edgels) + 1, bool), np.zeros(len(clusters), bool)
     free[-1] = False
     for _ in range(ROUNDS):
         for number in order[~edges[order]]:
             members = clusters[number]
-            if evidence(*sightings.views_of(members, free)) > least:
+            if evidence(*sightings.views_of(members, free), usual[number]) > least:
                 edges[number] = True
                 explains = sightings.edgels[members][sightings.owned[members]]
                 free[matching.neighbors[explains]] = False
     return edges
 
 
-def evidence(on, near):
-    """Log likelihood ratio of an edge over a contour, which has no more than CONTOUR_SHARE of its edgels on the line.
+def evidence(on, near, usual):
+    """Log likelihood ratio of an edge over what is none, which has no more than the `usual` share of its edgels on it.
 
     on, near: numbers of views. The share of an edge is not known, so it is what it is found to be.
     """
     share = np.clip(on / max(near, LEAST_DOUBT), LEAST_DOUBT, 1 - LEAST_DOUBT)
-    if share <= CONTOUR_SHARE:
+    if share <= usual:
         return 0.0
-    return near * (
-        share * np.log(share / CONTOUR_SHARE) + (1 - share) * np.log((1 - share) / (1 - CONTOUR_SHARE))
-    )
+    return near * (share * np.log(share / usual) + (1 - share) * np.log((1 - share) / (1 - usual)))
