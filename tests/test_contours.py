@@ -1,5 +1,7 @@
 """Edges told from occluding contours by where their edgels lie as the viewpoint moves."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from edgel_scenes import CylinderContour, arc, centre, line, pixel_of, tangents, views_of
@@ -23,12 +25,13 @@ def taichi(start_taichi):
     start_taichi("f32", 2)
 
 
-def judged(views, curves, radii=(1.0,)):
-    """(m,) bool: which of the clusters of points along some curves pass for edges."""
+def judged(views, curves, radii=(1.0,), moved=True):
+    """(m,) bool: which of the clusters of points along some curves, `moved` to their edgels or not, pass for edges."""
     s = np.linspace(0.1, 0.9, 40)
-    places, along = (np.concatenate([of(curve) for curve in curves]) for of in (lambda c: c(s), lambda c: tangents(c, s)))
+    places, along = (np.concatenate([of(curve, s) for curve in curves]) for of in (lambda c, s: c(s), tangents))
     matching = EdgelMatching(views)
     found = refine_points(matching, places, along, radii)
+    found = found if moved else replace(found, points=places, directions=along)
     labels = np.repeat(np.arange(len(curves)), len(s))
     return steady_edges(matching, found.points, found.directions, labels, explain(matching, found), LEAST)
 
@@ -76,7 +79,7 @@ def test_a_line_whose_edgels_others_explain_is_none(generator):
     """A second line 2/3 of a pixel beside an edge lies on the edgels of that one only."""
     views = views_of([A, RIM], generator, noise_px=NOISE_PX)
     beside = line(np.array([0.2, 0.3, 0.303]), np.array([0.8, 0.35, 0.403]))
-    np.testing.assert_array_equal(judged(views, [A, beside, RIM], radii=(1e-9,)), [True, False, True])
+    np.testing.assert_array_equal(judged(views, [A, beside, RIM], moved=False), [True, False, True])
 
 
 def test_evidence_grows_with_the_share_and_with_the_views():
@@ -96,7 +99,9 @@ def test_the_assembly_is_left_without_contours(generator):
     found = refine_points(
         matching, np.concatenate([limb(s), A(s)]), np.concatenate([tangents(limb, s), tangents(A, s)]), (3.0, 1.0)
     )
-    assembly = Assembly(np.repeat([0, 1], 40), np.array([[0, 1], [79, 0]]), np.arange(2.0)[:, None] * np.ones(ARC_NUMBERS))
+    assembly = Assembly(
+        np.repeat([0, 1], 40), np.array([[0, 1], [79, 0]]), np.arange(2.0)[:, None] * np.ones(ARC_NUMBERS)
+    )
     explained = explain(matching, found)
     kept, contours = without_contours(assembly, found.points, found.directions, explained, views, LEAST)
     assert contours == 1 and kept.arcs[:, 0].tolist() == [1.0]

@@ -22,8 +22,8 @@ OWNED_PX = 1.0  # an edge explains the edgels so near to it
 CONTOUR_SHARE = 0.45  # of a contour's edgels near a line that lie on it; those of pipes and blades: 0.3 .. 0.55
 CHANCE_SHARE = 0.38  # the same where no single contour can be what is seen, only edgels that happen to be near
 ROUNDS = 2  # what is no edge is looked at again when all edges have taken their edgels
-# Over the angle to either side of their mean a contour moves by half the radius times its square: from directions nearer
-# to each other than this, one of 15 pixels stays within the half pixel in which edgels are on a line.
+# Over an angle to either side of their mean a contour moves by half the radius times its square: from directions within
+# this, one of 15 pixels stays within the half pixel in which edgels are on a line.
 LEAST_ANGLE = np.radians(15.0)
 WIDE_ANGLE = np.radians(45.0)  # seen over so much to either side, only a contour of 5 pixels stays near
 LEAST_DOUBT = 1e-6  # of a share, from 0 and 1
