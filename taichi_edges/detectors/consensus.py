@@ -8,6 +8,8 @@ from taichi_edges.cameras import NEAR, inside_image
 from taichi_edges.detectors.backgrounds import CLEAR
 from taichi_edges.detectors.offsets import (
     LEAST_OBSERVATIONS,
+    MOST_RESIDUAL,
+    NORMAL_MAD,
     Estimate,
     Observations,
     camera_leverage,
@@ -19,13 +21,21 @@ from taichi_edges.views import pixel_size
 LEAST_POINTS, MOST_POINTS = 50, 3000  # fewer are no use; more only cost time: each is seen by most of the views
 REACHES = (5.0, 3.0)  # px around a 3D point within which an edgel may be its, round by round
 FARTHEST_PX = 3.0  # that a point is moved in one round
-MOST_SILHOUETTE = 0.85  # of a point's observations; with more it cannot tell its own displacement from their offset
+# Two edgels place a point whatever they are, and it would agree with them to nothing: what few views see, as between
+# bars whose lines blend in most views, is chance, and makes the rest look better than it is.
+LEAST_SEEN, LEAST_SEEN_SHARE = 5, 0.2  # views, and share of all of them, that see a point
+# Silhouettes are held against points that edgels inside place, and one of these is to spare. A point on the occluding
+# contour of a slim shaft is on silhouettes in all views; its displacement and their offset cannot be told apart.
+LEAST_INSIDE = 3
+MOST_SILHOUETTE = 0.85  # of a point's observations; a few chance edgels inside do not place what is a contour
+# Contours move over the surface with the viewpoint, and where a view's background is wrong silhouettes are none.
+STEADY_SHARE = 2 / 3  # of a point's silhouettes, and of its edgels inside, that agree with it
+AGREEING_PX, AGREEING_SCALES = 0.5, 3.0  # px, and standard deviations of the residuals, to which edgels agree
 # Standard errors through 3D points, of the outward offset and the shift's coordinates, for each px of median residual,
 # that no leaving out of observations shows: interior edges have small biases of their own, which points on them take
 # over. On exact CAD models, with residuals of 0.17 px, the offset came out wrong by 0.17 px and the shift by 0.08.
 OWN_ERRORS = np.array([0.6, 0.4, 0.4])
 CAMERA_ERROR = 0.1  # px; cameras are not known better, whatever the residuals say
-MOST_RESIDUAL = 0.35  # px, median; where views agree no better, as on textured photographs, chance has made the pairs
 WALK, STEP = 8.0, 1.0  # px to each side of a projection that are looked at; lines in an edgel table are two px or more
 SAME_LINE = 2.5  # px; edgels farther apart across the edge are of two lines
 ALIGNED = np.cos(np.radians(20.0))  # an edgel runs along the projection of its point's line, to that angle
@@ -52,15 +62,21 @@ class Consensus:
             return None, f"{len(self.points)} 3D points are too few to calibrate with; {LEAST_POINTS} are needed"
         values = np.where(np.isnan(known), start, known)
         for reach in REACHES:
-            observations = self.observe(values, reach)
+            observations = self._redundant(self.observe(values, reach))
             if len(observations) < LEAST_OBSERVATIONS:
                 return None, f"3D points explain only {len(observations)} edgels; {LEAST_OBSERVATIONS} are needed"
             fit = fit_offsets(observations, known, len(self.points))
             self._move(fit)
             values = fit.values
-        observations = self._balanced(self.observe(values, REACHES[-1]))
-        if len(observations) < LEAST_OBSERVATIONS:
-            return None, "nearly all 3D points are on silhouettes only"
+        observations = self._balanced(self._redundant(self.observe(values, REACHES[-1])))
+        if len(observations) >= LEAST_OBSERVATIONS:
+            observations = self._steady(observations, fit_offsets(observations, known, len(self.points)))
+        if len(observations) < LEAST_OBSERVATIONS or len(np.unique(observations.owners)) < LEAST_POINTS:
+            return None, "nearly all 3D points are on silhouettes only, or not steady"
+        return self._weighed(observations, known)
+
+    def _weighed(self, observations, known):
+        """Estimate from the observations, or None, and then why, or ''."""
         fit = fit_offsets(observations, known, len(self.points))
         residual = np.median(np.abs(fit.residuals))
         if residual > MOST_RESIDUAL:
@@ -111,11 +127,30 @@ class Consensus:
         moves = np.clip(fit.displacements, -FARTHEST_PX, FARTHEST_PX)
         self.points = self.points + self.pixel * np.einsum("nk,nkj->nj", moves, self.across)
 
+    def _redundant(self, observations):
+        """The observations of points that enough views see to disagree."""
+        least = max(LEAST_SEEN, LEAST_SEEN_SHARE * len(self.views))
+        return observations.keep((self._counts(observations) >= least)[observations.owners])
+
     def _balanced(self, observations):
         """The observations of points that are seen inside often enough."""
-        counts = np.bincount(observations.owners, minlength=len(self.points))
-        silhouettes = np.bincount(observations.owners, observations.silhouette, len(self.points))
-        return observations.keep((silhouettes <= MOST_SILHOUETTE * counts)[observations.owners])
+        counts = self._counts(observations)
+        silhouettes = self._counts(observations, observations.silhouette)
+        enough = (counts - silhouettes >= LEAST_INSIDE) & (silhouettes <= MOST_SILHOUETTE * counts)
+        return observations.keep(enough[observations.owners])
+
+    def _steady(self, observations, fit):
+        """The observations of points that most of their edgels agree with, on silhouettes as well as inside."""
+        sizes = np.abs(fit.residuals)
+        agree = sizes <= max(AGREEING_PX, AGREEING_SCALES * NORMAL_MAD * np.median(sizes))
+        steady = np.ones(len(self.points), bool)
+        for kind in (observations.silhouette > 0, observations.silhouette == 0):
+            steady &= self._counts(observations, kind & agree) >= STEADY_SHARE * self._counts(observations, kind)
+        return observations.keep(steady[observations.owners])
+
+    def _counts(self, observations, weights=None):
+        """(p,) of each point the number of its observations, or the sum of their weights."""
+        return np.bincount(observations.owners, weights, len(self.points))
 
     def _residuals_in(self, view, edgels):
         """`residuals` of one view's edgels."""
