@@ -109,11 +109,10 @@ def calibrate(views, edgels, points, directions, fixed_shift=None, fixed_silhoue
     silhouette, shift = (_choose(part, known, estimates) for part in (slice(0, 1), slice(1, 3)))
     values = np.concatenate([silhouette.applied_values, shift.applied_values])
     corrected, on_silhouette = sides.correct(edgels, values)
-    residuals = np.full(len(edgels), np.nan) if reason else consensus.residuals(values)
     return corrected, Calibration(
         *(shift.values, shift.errors, shift.method, shift.applied),
         *(float(silhouette.values[0]), float(silhouette.errors[0]), silhouette.method, silhouette.applied),
-        *(residuals, on_silhouette, sides.outward, reason),
+        *(consensus.residuals(values), on_silhouette, sides.outward, reason),
     )
 
 
