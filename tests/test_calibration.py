@@ -257,7 +257,7 @@ def test_chance_pairs_between_thin_bars_are_no_bias(generator):
 
 def test_contours_of_a_slim_shaft_are_no_bias(generator):
     # Seen from anywhere a contour lies the radius, some pixels, outside the axis.
-    views, edgels, *seeds = unbiased("shaft", generator, smooth=1000)
+    views, edgels, *seeds = unbiased("shaft", generator, size=400, smooth=1000)
     corrected, found = calibrate(views, edgels, *seeds)
     assert not found.shift_applied and not found.silhouette_applied
     np.testing.assert_array_equal(corrected.points, edgels.points)
