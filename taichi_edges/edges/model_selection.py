@@ -196,7 +196,11 @@ def distances_to(shape, points):
 
 
 def _distances_to_ellipse(shape, points):
-    """(n,) distances of points to an EllipticArc: exact for a circle, by Newton's steps on the angle for an ellipse."""
+    """(n,) distances of points to an EllipticArc: exact for a circle, by Newton's steps on the angle for an ellipse.
+
+    Of a point farther from an elliptic arc than its least radius of curvature, too great if the nearest place of the
+    whole ellipse is not on the arc.
+    """
     offsets = points - shape.centre
     x, y = (offsets @ axis / radius for axis, radius in zip(shape.axes, shape.radii, strict=True))
     t = np.arctan2(y / shape.radii[1], x / shape.radii[0]) if shape.circular else np.arctan2(y, x)
