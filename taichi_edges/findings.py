@@ -85,7 +85,7 @@ def describe_evaluate(facts):
 
 
 def describe_export(facts):
-    """'edges.ply, edges.obj, overlays.png and 4 pictures in overlays/'."""
+    """'edges.ply, edges.dxf, overlays.png and 4 pictures in overlays/'."""
     files = [name for name in facts["files"] if "/" not in name]
     return f"{', '.join(files)} and {amount(len(facts['files']) - len(files), 'picture')} in overlays/"
 

@@ -2,26 +2,28 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from taichi_edges.cameras import Similarity
-from taichi_edges.edge_set import EdgeSet
 from taichi_edges.errors import UserError
 from taichi_edges.exporters import EXPORTERS
 from taichi_edges.exporters.line_sets import (
     CURVE_SEGMENTS,
-    edge_colours,
+    edge_paths,
     line_set_arrays,
     write_line_set_obj,
     write_line_set_ply,
 )
 from taichi_edges.exporters.overlays import (
     FADED_TO,
+    FAINTEST,
     IMAGE_FADE,
     background,
+    caption,
     choose_views,
     clip_segments,
     contact_sheet,
@@ -32,7 +34,9 @@ from taichi_edges.exporters.palette import CLUSTER_COLOURS, CURVE_COLOUR, LINE_C
 from taichi_edges.exporters.point_cloud import read_oriented_points, write_oriented_points
 from taichi_edges.exporters.splats import FIELDS, HARMONIC_0, read_gaussians, write_gaussians
 from taichi_edges.exporters.viewer import build_geometries, show
+from taichi_edges.shapes import EllipticArc, Line, Spline, polyline
 from taichi_edges.views import Views
+from taichi_edges.wireframe import Edge, Evidence, Wireframe
 
 FOCAL = 100.0  # pixels
 WIDTH, HEIGHT = 160, 120
@@ -43,11 +47,29 @@ def rng():
     return np.random.default_rng(7)
 
 
+NOTHING = Wireframe.loose([])
+
+
 @pytest.fixture
 def edges(rng):
-    """Three lines and two curves; the curves are pieces of one edge, and one line comes from no cluster."""
-    lines, curves = rng.normal(size=(3, 2, 3)), rng.normal(size=(2, 4, 3))
-    return EdgeSet(lines, curves, np.array([0, -1, 4]), np.array([9, 9]))
+    """A bent path of two lines and a spline of two cubics, and a circle; two edges are judged, two are not."""
+    vertices, control = rng.normal(size=(4, 3)), rng.normal(size=(5, 3))
+    spline = np.array([[vertices[2], *control[:3]], [control[2], *control[3:], vertices[3]]])
+    circle = EllipticArc(rng.normal(size=3), np.eye(3)[1:], 0.0, 2 * np.pi)
+    graph = (
+        Edge(Line(vertices[:2]), (0, 1), Evidence(41, 1.5, 0.25, 0.75)),
+        Edge(Spline(spline), (2, 3)),
+        Edge(Line(vertices[[2, 1]]), (2, 1), Evidence(1, 0.5, 0.5, 0.125)),
+        Edge(circle),
+    )
+    return Wireframe(vertices, graph, np.zeros((0, 2), np.int64))
+
+
+def lines_between(*ends, confidence=None):
+    """Loose lines, all of one confidence."""
+    loose = Wireframe.loose([Line(np.array(pair, float)) for pair in ends])
+    evidence = None if confidence is None else Evidence(9, 1.0, 0.2, confidence)
+    return Wireframe(loose.vertices, tuple(replace(edge, evidence=evidence) for edge in loose.edges), loose.contacts)
 
 
 def draw_gaussians(rng, count):
@@ -203,29 +225,42 @@ def test_cluster_colours_are_told_apart():
     assert label_colours([]).shape == (0, 3)
 
 
+def test_edges_that_meet_share_points(edges):
+    points, paths = edge_paths(edges)
+    np.testing.assert_array_equal(points[:4], edges.vertices)
+    assert [len(path) for path in paths] == [2, 2 * CURVE_SEGMENTS + 1, 2, 4 * CURVE_SEGMENTS + 1]
+    assert len(points) == 4 + 2 * CURVE_SEGMENTS - 1 + 4 * CURVE_SEGMENTS  # none twice
+    assert paths[0][1] == paths[2][1] == 1 and paths[1][0] == paths[2][0] == 2 and paths[3][0] == paths[3][-1]
+    for path, shape in zip(paths, edges.shapes, strict=True):
+        np.testing.assert_allclose(points[path], polyline(shape, CURVE_SEGMENTS), rtol=0, atol=1e-12)
+
+
 def test_open3d_reads_the_line_set_back(tmp_path, edges):
     import open3d as o3d
 
     path = write_line_set_ply(tmp_path / "edges.ply", edges)
     line_set = o3d.io.read_line_set(str(path))
-    vertices, pairs = np.asarray(line_set.points), np.asarray(line_set.lines)
-    np.testing.assert_array_equal(vertices, np.concatenate(edges.polylines(CURVE_SEGMENTS)))
-    assert len(pairs) == 3 + 2 * CURVE_SEGMENTS
-    # Every segment joins neighbours of one polyline, and every polyline is whole.
-    expected, first = [], 0
-    for polyline in edges.polylines(CURVE_SEGMENTS):
-        expected += [(first + step, first + step + 1) for step in range(len(polyline) - 1)]
-        first += len(polyline)
-    assert [tuple(pair) for pair in pairs.tolist()] == expected
-    colours = np.rint(np.asarray(line_set.colors) * 255)
-    np.testing.assert_array_equal(colours, np.repeat(edge_colours(edges), [1, 1, 1, 32, 32], axis=0))
-    np.testing.assert_array_equal(colours[1], UNLABELLED_COLOUR)
-    np.testing.assert_array_equal(colours[3], colours[-1])  # two pieces of one smooth edge
+    points, segments, owners = line_set_arrays(edges)
+    np.testing.assert_array_equal(np.asarray(line_set.points), points)
+    np.testing.assert_array_equal(np.asarray(line_set.lines), segments)
+    assert len(segments) == 2 + 6 * CURVE_SEGMENTS
+    np.testing.assert_array_equal(np.rint(np.asarray(line_set.colors) * 255), CLUSTER_COLOURS[owners])
+
+
+def test_line_set_says_of_each_segment_its_edge_and_confidence(tmp_path, edges):
+    content = write_line_set_ply(tmp_path / "edges.ply", edges).read_bytes()
+    header, body = content.split(b"end_header\n", 1)
+    assert header.endswith(b"property float confidence\nproperty int edge\n")
+    _, _, owners = line_set_arrays(edges)
+    fields = [("ends", "<i4", 2), ("colour", "u1", 3), ("confidence", "<f4"), ("edge", "<i4")]
+    segments = np.frombuffer(body[-len(owners) * np.dtype(fields).itemsize :], fields)
+    np.testing.assert_array_equal(segments["edge"], owners)
+    np.testing.assert_array_equal(segments["confidence"], np.array([0.75, np.nan, 0.125, np.nan])[owners])
 
 
 def test_obj_holds_every_edge_as_an_object_to_the_last_digit(tmp_path, edges):
     path = write_line_set_obj(tmp_path / "edges.obj", edges)
-    vertices, objects = [], {}
+    vertices, objects, said, name = [], {}, {}, None
     for line in path.read_text().splitlines():
         kind, _, rest = line.partition(" ")
         if kind == "o":
@@ -233,26 +268,48 @@ def test_obj_holds_every_edge_as_an_object_to_the_last_digit(tmp_path, edges):
         elif kind == "v":
             vertices.append([float(number) for number in rest.split()])
         elif kind == "l":
-            objects[name] = np.array(vertices)[np.array(rest.split(), int) - 1]
-    assert list(objects) == ["line_0", "line_1", "line_2", "curve_0", "curve_1"]
-    for parsed, polyline in zip(objects.values(), edges.polylines(32), strict=True):
-        np.testing.assert_array_equal(parsed, polyline)
+            objects[name] = np.array(rest.split(), int) - 1
+        elif name:
+            said[name] = rest
+    assert list(objects) == ["line_0", "spline_1", "line_2", "circle_3"]
+    points, paths = edge_paths(edges)
+    np.testing.assert_array_equal(vertices, points)
+    for written, path in zip(objects.values(), paths, strict=True):
+        np.testing.assert_array_equal(written, path)
+    assert said == {
+        "line_0": "confidence 0.75, 41 views, residual 0.25 px",
+        "line_2": "confidence 0.12, 1 view, residual 0.50 px",
+    }
 
 
 @pytest.mark.parametrize("suffix", EXPORTERS)
 def test_exporters_say_when_there_are_no_edges(tmp_path, suffix):
     with pytest.raises(UserError, match="there are no edges to write"):
-        EXPORTERS[suffix](tmp_path / f"edges{suffix}", EdgeSet.of())
+        EXPORTERS[suffix](tmp_path / f"edges{suffix}", NOTHING)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("suffix", EXPORTERS)
 def test_exporters_write_lines_without_curves_and_curves_without_lines(tmp_path, edges, suffix):
-    for part in (EdgeSet.of(lines=edges.lines), EdgeSet.of(curves=edges.curves)):
-        assert EXPORTERS[suffix](tmp_path / f"edges{suffix}", part).stat().st_size > 100
+    for part in (edges.edges[::2], edges.edges[1:2], edges.edges[3:]):
+        written = EXPORTERS[suffix](tmp_path / f"edges{suffix}", Wireframe(edges.vertices, part, edges.contacts))
+        assert written.stat().st_size > 100
 
 
-def test_interrupted_write_leaves_the_old_file(tmp_path, edges, rng, monkeypatch):
+@pytest.mark.parametrize("suffix", EXPORTERS)
+def test_interrupted_write_leaves_the_old_file(tmp_path, edges, suffix, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    path = EXPORTERS[suffix](tmp_path / f"edges{suffix}", edges)
+    before = path.read_bytes()
+    monkeypatch.setattr("os.replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        EXPORTERS[suffix](path, lines_between([[0, 0, 0], [1, 1, 1]]))
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+def test_interrupted_cloud_leaves_the_old_file(tmp_path, rng, monkeypatch):
     import open3d as o3d
 
     def interrupted(path, *_):
@@ -261,24 +318,20 @@ def test_interrupted_write_leaves_the_old_file(tmp_path, edges, rng, monkeypatch
         raise KeyboardInterrupt
 
     points = rng.normal(size=(5, 3))
-    ply = write_line_set_ply(tmp_path / "edges.ply", edges)
     cloud = write_oriented_points(tmp_path / "points.ply", points, points)
-    before = ply.read_bytes(), cloud.read_bytes()
-    monkeypatch.setattr(o3d.io, "write_line_set", interrupted)
+    before = cloud.read_bytes()
     monkeypatch.setattr(o3d.t.io, "write_point_cloud", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        write_line_set_ply(ply, EdgeSet.of(lines=edges.lines))
-    with pytest.raises(KeyboardInterrupt):
         write_oriented_points(cloud, 2 * points, points)
-    assert (ply.read_bytes(), cloud.read_bytes()) == before
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["edges.ply", "points.ply"]
+    assert cloud.read_bytes() == before and list(tmp_path.iterdir()) == [cloud]
 
 
 def test_overlay_draws_edges_where_they_project_and_nothing_elsewhere(tmp_path):
     line = [at_pixel(20, 30, 1.0), at_pixel(90, 40, 3.0)]
     start, end = np.array([40.0, 100.0]), np.array([130.0, 70.0])
     straight = [at_pixel(*(start + step / 3 * (end - start)), 2.0) for step in range(4)]  # a curve, but easy to check
-    (path,) = draw_overlays(tmp_path, one_view(), EdgeSet.of([line], [straight]))
+    shapes = [Line(np.array(line)), Spline(np.array([straight]))]
+    (path,) = draw_overlays(tmp_path, one_view(), Wireframe.loose(shapes))
     picture = read_picture(path)
     to_line, to_curve = distance_to_segment((20, 30), (90, 40)), distance_to_segment(start, end)
     to_dots = np.min([distance_to_segment(p, np.add(p, 1e-6)) for p in ((20, 30), (90, 40), start, end)], axis=0)
@@ -289,15 +342,48 @@ def test_overlay_draws_edges_where_they_project_and_nothing_elsewhere(tmp_path):
         assert np.abs(picture[core] - colour).max() < 60
     away = np.minimum(np.minimum(to_line, to_curve), to_dots - 1) > 2.0
     assert (picture[away] == 255).all()
-    for u, v in ((20, 30), (90, 40), (40, 100), (130, 70)):
-        assert (picture[v, u] < 60).all()
+
+
+def test_overlay_marks_shared_vertices_by_dots_and_free_ends_by_rings(tmp_path):
+    """Two lines that meet, and a third that ends on the first."""
+    pixels = np.array([(20, 20), (100, 20), (140, 90), (60, 20), (60, 100)])
+    vertices = np.array([at_pixel(u, v, 2.0) for u, v in pixels])
+    joins = ((0, 1), (1, 2), (3, 4))
+    graph = tuple(Edge(Line(vertices[list(ends)]), ends) for ends in joins)
+    (path,) = draw_overlays(tmp_path, one_view(), Wireframe(vertices, graph, np.array([[3, 0]])))
+    picture = read_picture(path)
+    shared, free = pixels[[1, 3]], pixels[[0, 2, 4]]
+    assert (picture[shared[:, 1], shared[:, 0]] < 60).all()
+    assert (picture[free[:, 1], free[:, 0]] > 180).all()
+    for u, v in free:  # around the hole there is ink on all sides
+        around = picture[v - 3 : v + 4, u - 3 : u + 4].min(axis=2)
+        assert (np.array([half.min() for half in (around[:3], around[4:], around[:, :3], around[:, 4:])]) < 150).all()
+
+
+@pytest.mark.parametrize(("confidence", "opacity"), [(1.0, 1.0), (0.5, 0.65), (0.0, FAINTEST)])
+def test_overlay_draws_doubtful_edges_fainter(tmp_path, confidence, opacity):
+    """Than an edge that nobody has judged."""
+    across = [at_pixel(-50, 60, 2.0), at_pixel(300, 60, 2.0)]
+    inks = []
+    for wireframe in (lines_between(across), lines_between(across, confidence=confidence)):
+        (path,) = draw_overlays(tmp_path, one_view(), wireframe)
+        inks.append((255 - read_picture(path)[50:70, 80, 2]).sum())
+    assert inks[1] / inks[0] == pytest.approx(opacity, abs=0.02)  # grey levels are rounded
+
+
+def test_caption_counts_edges_and_what_is_drawn(edges, monkeypatch):
+    """Not pieces: the spline and the circle are six cubics."""
+    said = []
+    monkeypatch.setattr("taichi_edges.exporters.overlays._write", lambda strip, words, *_: said.append(words))
+    caption(800, "a view", edges)
+    assert sorted(said) == ["a view", "curves 2", "free ends 2", "lines 2", "vertices 2"]
 
 
 def test_overlay_places_strokes_to_a_fraction_of_a_pixel(tmp_path):
     """Pixel centres at integers: the middle of the ink is the projected position."""
     for u in (50.0, 50.3, 50.5):
         line = [at_pixel(u, -50, 2.0), at_pixel(u, 300, 2.0)]
-        (path,) = draw_overlays(tmp_path, one_view(), EdgeSet.of([line]))
+        (path,) = draw_overlays(tmp_path, one_view(), lines_between(line))
         ink = 255.0 - read_picture(path)[60, :, 2]
         assert abs((ink * np.arange(WIDTH)).sum() / ink.sum() - u) < 0.15  # the mask is four times finer: 1/8 pixel
 
@@ -305,7 +391,7 @@ def test_overlay_places_strokes_to_a_fraction_of_a_pixel(tmp_path):
 def test_edge_that_passes_behind_the_camera_is_cut_there(tmp_path):
     """Seen from the origin the line goes right and out of the picture; its far end is behind the camera."""
     front, behind = np.array(at_pixel(100, 60, 2.0)), np.array([0.6, 0.02, -3.0])
-    (path,) = draw_overlays(tmp_path, one_view(), EdgeSet.of([[front, behind]]))
+    (path,) = draw_overlays(tmp_path, one_view(), lines_between([front, behind]))
     picture = read_picture(path)
     samples = front + np.linspace(0, 1, 2001)[:, None] * (behind - front)
     pixels, _ = one_view().project(samples, 0)
@@ -316,7 +402,7 @@ def test_edge_that_passes_behind_the_camera_is_cut_there(tmp_path):
     assert nearest.max() < 3.0
     assert u.max() == WIDTH - 1 and u.min() > 96
     # One that is behind all the way leaves no ink.
-    (path,) = draw_overlays(tmp_path, one_view(), EdgeSet.of([[behind, -front]]))
+    (path,) = draw_overlays(tmp_path, one_view(), lines_between([behind, -front]))
     assert (read_picture(path) == 255).all()
 
 
@@ -381,7 +467,7 @@ def test_overlay_views_look_in_different_directions():
 
 def test_overlays_have_names_captions_and_fit_on_a_sheet(tmp_path):
     views = make_views([turned(angle) for angle in (0, 90, 180)], edge_maps=np.zeros((3, HEIGHT, 640), np.uint8))
-    paths = draw_overlays(tmp_path / "overlays", views, EdgeSet.of(), count=3)
+    paths = draw_overlays(tmp_path / "overlays", views, NOTHING, count=3)
     assert [path.name for path in paths] == [f"overlay_000{index}_view_{index}.png" for index in range(3)]
     pictures = [cv2.imread(str(path)) for path in paths]
     captions = [picture[HEIGHT:] for picture in pictures]
@@ -441,7 +527,7 @@ def test_viewer_geometries_hold_points_directions_and_edges(edges, rng):
     np.testing.assert_allclose((ends[:, 1] - ends[:, 0])[:, :2], 0, atol=1e-12)
     assert (ends[:, 1, 2] > ends[:, 0, 2]).all()
     assert len(line_set.lines) == len(line_set_arrays(edges)[1]) == len(line_set.colors)
-    assert build_geometries(np.zeros((0, 3)), np.zeros((0, 3)), EdgeSet.of()) == []
+    assert build_geometries(np.zeros((0, 3)), np.zeros((0, 3)), NOTHING) == []
 
 
 def test_exporters_are_imported_without_open3d():

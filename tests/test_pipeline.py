@@ -17,6 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from part21 import read_step
 from scipy.spatial import cKDTree
 
 from taichi_edges.artefacts import digest_file, remove_unfinished, replacing
@@ -33,6 +34,7 @@ from taichi_edges.scene_file import check_scene, load_scene, parse_yaml
 from taichi_edges.splatting.seeding import given_points
 from taichi_edges.stages import evaluate
 from taichi_edges.views import Views, read_views, write_views
+from taichi_edges.wireframe import read_wireframe
 
 ROOT = Path(__file__).parent.parent
 ARTEFACTS = (
@@ -46,6 +48,8 @@ ARTEFACTS = (
     "metrics.csv",
     "edges.ply",
     "edges.obj",
+    "edges.dxf",
+    "edges.step",
     "overlays.png",
     "run.json",
     "scene.yaml",
@@ -248,6 +252,21 @@ def test_everything_exported_is_in_the_frame_of_the_input(finished, tmp_path):
 # ----------------------------------------------------------------------------------------------------- a whole run
 
 
+def test_cad_files_hold_the_edges_of_the_run(finished):
+    import ezdxf
+
+    _, runs, _ = finished
+    wireframe, _ = read_wireframe(runs / "tiny/edges.json")
+    edges, _ = read_step(runs / "tiny/edges.step")
+    document = ezdxf.readfile(runs / "tiny/edges.dxf")
+    assert not document.audit().errors and len(document.modelspace()) == len(edges) == len(wireframe)
+    for number, (edge, shape) in enumerate(zip(edges, wireframe.shapes, strict=True)):
+        assert edge.name.split(",")[0] == f"{shape.kind}_{number}"
+        np.testing.assert_allclose(edge.ends, shape.ends, rtol=0, atol=1e-9)
+        if shape.kind != "spline":  # whose parameter is another one
+            np.testing.assert_allclose(edge.at([0.3, 0.8]), shape.at([0.3, 0.8]), rtol=0, atol=1e-9)
+
+
 def test_all_artefacts_are_there_and_can_be_read(finished):
     _, runs, _ = finished
     folder = runs / "tiny"
@@ -289,11 +308,10 @@ def test_output_is_a_summary_and_the_progress_goes_to_standard_error(finished):
     _, _, done = finished
     assert "Taichi" not in done.stdout + done.stderr
     assert done.stdout.startswith("tiny: metrics\n") and "F-score at 5 mm" in done.stdout
-    assert "results: " in done.stdout and "edges.json, edges.ply, edges.obj, overlays.png" in done.stdout
+    exported = "edges.ply, edges.obj, edges.dxf, edges.step, overlays.png"
+    assert "results: " in done.stdout and f"edges.json, {exported}" in done.stdout
     lines = done.stderr.splitlines()
-    assert lines[0] == "prepare ..." and lines[-1].startswith(
-        "export: edges.ply, edges.obj, overlays.png and 4 pictures"
-    )
+    assert lines[0] == "prepare ..." and lines[-1].startswith(f"export: {exported} and 4 pictures")
     assert any(
         re.fullmatch(r"train: \d+ Gaussians after 480 view steps, final loss 0\.\d{4} \(.* s\)", line) for line in lines
     )

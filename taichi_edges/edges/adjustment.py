@@ -27,7 +27,7 @@ from taichi_edges.viewing_planes import SCALE_PX
 from taichi_edges.wireframe import Wireframe
 
 RADII_PX = (3.0, 2.0, 1.5, 1.0, 1.0)  # of the edgels that are looked at, round by round
-CORRELATED_PX = 10.0  # along an edge: pixels that count as one observation
+CORRELATED_PX = 40.0  # along an edge: pixels that count as one observation; 20 to 55 in images and in learned maps
 LEAST_NOISE_PX = 0.05  # of the edgels; the best detector's
 START_PX = 1.0  # standard deviation of the edges that are given
 END_PX, MOST_ENDS = 3.0, 0.25  # edgels so near to an end say nothing; at most so much of the length at either end
@@ -169,7 +169,7 @@ def image_equations(problem, wireframe, matching, radius):
     for number, unknowns in enumerate(problem.layout.columns):
         part = samples.of(number)
         parameters = samples.parameters[part]
-        slopes = derivatives(_neighbors(wireframe, number), lambda shape: shape.at(parameters))  # (n, 3, k)
+        slopes = derivatives(neighbors_of(wireframe, number), lambda shape: shape.at(parameters))  # (n, 3, k)
         before = samples.points[part] - problem.start.edges[number].shape.at(parameters)
         weight = 1.0 / (len(before) * (START_PX * pixel) ** 2)
         _add_places(equations, unknowns, slopes, planes[part] + weight * np.eye(3), pulls[part] + weight * before)
@@ -226,7 +226,7 @@ def _ends(wireframe, number):
     return wireframe.vertices[list(vertices)] if vertices else None
 
 
-def _neighbors(wireframe, number):
+def neighbors_of(wireframe, number):
     """See `charts.neighbors`."""
     return neighbors(wireframe.edges[number].shape, _ends(wireframe, number))
 
@@ -238,7 +238,7 @@ def _stepped(problem, wireframe, image):
     """
     layout, start = problem.layout, problem.start.shapes
     constraints = [*smooth_joints(wireframe), *contacts(wireframe, problem.pixel), *problem.relations]
-    joined = _constrained(layout, wireframe, constraints)
+    joined = constrained(layout, wireframe, constraints)
     matrix, target = image.matrix() + joined.matrix(), image.target + joined.target
     free = np.ones(layout.size, bool)
     while free.any():
@@ -266,7 +266,7 @@ def _polished(problem, wireframe, matrix):
         constraints = [c for c in (*contacts(wireframe, problem.pixel), *problem.relations) if c.hard]
         if not constraints:
             break
-        joined = _constrained(problem.layout, wireframe, constraints, HARD)
+        joined = constrained(problem.layout, wireframe, constraints, HARD)
         step = solve(matrix + joined.matrix(), joined.target, np.ones(problem.layout.size, bool))
         wireframe = problem.layout.moved(wireframe, step)
     return wireframe
@@ -294,13 +294,13 @@ def with_vertices(wireframe, vertices):
     return replace(wireframe, vertices=vertices, edges=tuple(edges))
 
 
-def _constrained(layout, wireframe, constraints, hard=None):
+def constrained(layout, wireframe, constraints, hard=None):
     """Equations of the constraints at a Wireframe. hard: weight of their values in place of their own deviations."""
     equations, shapes, pairs = Equations(layout.size), wireframe.shapes, {}
     for constraint in constraints:
         slopes, edges = [], [shapes[number] for number in constraint.edges]
         for place, number in enumerate(constraint.edges):
-            pairs[number] = pairs.get(number) or _neighbors(wireframe, number)
+            pairs[number] = pairs.get(number) or neighbors_of(wireframe, number)
             slopes.append(derivatives(pairs[number], partial(_replaced, constraint.values, edges, place)))
         unknowns = np.concatenate([layout.columns[number] for number in constraint.edges])
         weight = 1.0 / constraint.deviation**2 * (hard or 1.0)

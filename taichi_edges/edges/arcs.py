@@ -110,7 +110,7 @@ class Arc:
         tangent, inward, _ = self.frame
         axes = np.array([-inward, tangent]) / self.curvature
         low = self.low * self.curvature
-        high = low + 2 * np.pi if self.closed else self.high * self.curvature
+        high = low + 2 * np.pi if self.closed else min(self.high * self.curvature, low + 2 * np.pi)
         return EllipticArc(self.origin + inward / self.curvature, axes, low, high)
 
     def over(self, low, high):

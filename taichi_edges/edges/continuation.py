@@ -26,6 +26,7 @@ PARALLEL = np.cos(np.radians(20.0))
 JOINT_COSINE = np.cos(np.radians(25.0))  # between the tangents of two strokes that continue each other
 JOINT_GAP_PX = 12.0  # between their ends, along; a tail or a gap at a touching edge is as long
 JOINT_ASIDE = 0.25  # of that gap: how far aside the other end may lie, beyond BESIDE
+SPACING_PX = 2.0  # of the places by which strokes are compared
 LONGEST_RUN = 8  # strokes that may become one at once
 FOLLOWED = 0.5  # of the places of a stroke that the shape which replaces it runs along, at least
 CHORDS = 512  # of a shape, for its tangents
@@ -114,7 +115,7 @@ def goes_on(shape, places, pixel, seen, least=0.0):
     """
     count = max(int(np.ceil(shape.length / pixel)), 8)
     parameters = (np.arange(count) + 0.5) / count
-    covered = cKDTree(places).query(shape.at(parameters))[0] <= 1.5 * pixel
+    covered = cKDTree(places).query(shape.at(parameters))[0] <= SPACING_PX * pixel
     if covered.all() or covered.mean() < least:
         return bool(covered.all())
     views = seen(shape, parameters)
@@ -200,24 +201,19 @@ def cut_anew(shapes, path, yardstick, pixel, seen):
     """The shapes that describe a path with the least cost (BIC), each over a run of its strokes."""
     if len(path) == 1:
         return [shapes[path[0][0]]]
-    tracks = [oriented(track_of(shapes[number], pixel), backward) for number, backward in path]
+    tracks = [oriented(track_of(shapes[number], SPACING_PX * pixel), backward) for number, backward in path]
     count = observations(np.concatenate([track.share for track in tracks]), yardstick)
     least, choice = [0.0], []
-    for last in range(len(path)):
-        options = []
-        for first in range(max(0, last - LONGEST_RUN + 1), last + 1):
-            if first == last:
-                shape = shapes[path[last][0]]
-                options.append((least[first] + price_of(shape) * np.log(count), first, shape))
-            else:
-                run = tracks[first : last + 1]
-                shape, cost = best_shape(joined_track(run), yardstick, count)
-                if shape is not None and all(follows(shape, track, yardstick) for track in run):
-                    if goes_on(shape, np.concatenate([track.points for track in run]), pixel, seen):
-                        options.append((least[first] + cost, first, shape))
-        cost, first, shape = min(options, key=lambda option: option[0])
-        least.append(cost)
-        choice.append((first, shape))
+    for last, (number, _) in enumerate(path):
+        shape = shapes[number]
+        best = (least[last] + price_of(shape) * np.log(count), last, shape)
+        for first in range(last - 1, max(0, last - LONGEST_RUN + 1) - 1, -1):
+            run = tracks[first : last + 1]
+            shape, cost = best_shape(joined_track(run), yardstick, count, best[0] - least[first])
+            if shape is not None and replaces(shape, run, yardstick, pixel, seen):
+                best = (least[first] + cost, first, shape)
+        least.append(best[0])
+        choice.append(best[1:])
     cut, last = [], len(path) - 1
     while last >= 0:
         first, shape = choice[last]
@@ -226,9 +222,15 @@ def cut_anew(shapes, path, yardstick, pixel, seen):
     return cut[::-1]
 
 
-def follows(shape, track, yardstick):
-    """Does the shape say most of what a Track says? Else a short stroke could be explained away by long ones."""
-    return (distances_to(shape, track.points) <= BESIDE * yardstick.noise).mean() >= FOLLOWED
+def replaces(shape, run, yardstick, pixel, seen):
+    """Does the shape say most of what each of the Tracks of a run says, and do the images show it in between?
+
+    Without the former, a short stroke could be explained away by long ones.
+    """
+    for track in run:
+        if (distances_to(shape, track.points) <= BESIDE * yardstick.noise).mean() < FOLLOWED:
+            return False
+    return goes_on(shape, np.concatenate([track.points for track in run]), pixel, seen)
 
 
 def oriented(track, backward):

@@ -6,6 +6,7 @@ next to the edge), so an observation is a stretch of some pixels, however many p
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -21,7 +22,8 @@ MOST_CUBICS = 4  # of an open chain
 LEAST_BEND = 1.0  # noises that the middle of an arc is off its chord, at least
 LEAST_FLATNESS = 0.05  # of an ellipse: the shorter axis over the longer one
 LEAST_ROUND = np.radians(45.0)  # of an ellipse, to be told from other curves
-FIT_ROUNDS = 8
+FIT_ROUNDS = 4
+FEWEST_PLACES = 8  # on a shape, however short it is
 
 
 @dataclass(frozen=True)
@@ -79,33 +81,39 @@ def best_shape(track, yardstick, count, worth=np.inf):
     count: number of observations of all that is compared.
     """
     best, least = None, worth
-    for shape in candidates(track, yardstick):
-        price = price_of(shape) * np.log(count)
-        if price >= least:
+    for price, fit in candidates(track, yardstick):
+        if price * np.log(count) >= least:
             continue
-        cost = price + misfit(distances_to(shape, track.points), track.share, yardstick)
-        if cost < least:
-            best, least = shape, cost
+        shape = fit()
+        if shape is not None:
+            cost = price_of(shape) * np.log(count) + misfit(distances_to(shape, track.points), track.share, yardstick)
+            if cost < least:
+                best, least = shape, cost
     return best, least if best is not None else np.inf
 
 
 def candidates(track, yardstick):
-    """The shapes worth trying, the cheapest first."""
+    """Pairs of a price, and a function that fits a shape of at least that price, or None where there is none."""
     tolerance = 3.0 * yardstick.noise
-    line = fitted_line(track, tolerance)
-    if not track.closed:
-        yield line.shape()
-    bent = fitted_arc(track, tolerance, line)
-    if bent is not None:
-        yield bent.shape()
-        ellipse = fitted_ellipse(track)
-        if ellipse is not None:
-            yield ellipse
+    found = [] if track.closed else [(PRICES["line"], lambda: fitted_line(track, tolerance).shape())]
+    found.append((PRICES["circle" if track.closed else "arc"], partial(bent_shape, track, tolerance)))
+    found.append((PRICES["ellipse" if track.closed else "elliptic_arc"], partial(fitted_ellipse, track)))
     for cubics in range(4 if track.closed else 1, MOST_CUBICS + 1):
-        if len(track.points) < 6 * cubics:
-            break
-        curves, _ = fit_chain(track.points, track.ordering, tolerance, cubics)
-        yield Spline(curves, track.closed)
+        if len(track.points) >= 6 * cubics:
+            price = CUBIC_PRICE + NEXT_CUBIC_PRICE * (cubics - 1)
+            found.append((price, partial(fitted_spline, track, tolerance, cubics)))
+    return sorted(found, key=lambda pair: pair[0])
+
+
+def bent_shape(track, tolerance):
+    """The circular arc through a Track, or None where it is as good as straight."""
+    arc = fitted_arc(track, tolerance, fitted_line(track, tolerance))
+    return arc.shape() if arc is not None else None
+
+
+def fitted_spline(track, tolerance, cubics):
+    """The chain of some cubics through a Track."""
+    return Spline(fit_chain(track.points, track.ordering, tolerance, cubics)[0], track.closed)
 
 
 def fitted_line(track, tolerance):
@@ -218,7 +226,7 @@ def _distances_to_ellipse(shape, points):
 
 def track_of(shape, spacing):
     """The Track of a shape, places at most `spacing` apart, at the middles of equal steps."""
-    count = max(int(np.ceil(shape.length / spacing)), 3)
+    count = max(int(np.ceil(shape.length / spacing)), FEWEST_PLACES)
     fine = np.linspace(0, 1, 4 * count + 1)
     points = shape.at(fine)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])

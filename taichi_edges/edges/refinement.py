@@ -17,7 +17,7 @@ from taichi_edges.kernels.edgel_matching import EdgelMatching
 NOISE_PX = 0.2  # by which a place on an edge may be off its shape, at least: next to other edges every detector is
 STRETCH_PX = 4.0  # length of an edge on which the errors go together
 WIDE_GAP_PX = 24.0  # between strokes that continue each other, where their ends are still free after the first pass
-LEAST_SUPPORTED = 0.5  # of the length of an edge
+LEAST_SUPPORTED = 0.33  # of the length of an edge; where edges touch, only one of them owns the edgels
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def with_evidence(wireframe, matching):
 
 
 def with_support(matching, shapes):
-    """The shapes that the images support on half of their length, at least."""
+    """The shapes that the images support on a third of their length, at least."""
     pairs = zip(shapes, supported(matching, shapes), strict=True)
     return [shape for shape, found in pairs if found.supported_length >= LEAST_SUPPORTED * shape.length]
 

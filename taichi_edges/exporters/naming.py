@@ -3,6 +3,7 @@
 import math
 
 from taichi_edges.errors import UserError
+from taichi_edges.findings import amount
 
 
 def edge_name(number, edge):
@@ -17,8 +18,10 @@ def confidence_of(edge):
 
 def evidence_words(edge):
     """'confidence 0.93, 41 views, residual 0.21 px', '' without evidence."""
-    seen = edge.evidence
-    return f"confidence {seen.confidence:.2f}, {seen.views} views, residual {seen.residual_px:.2f} px" if seen else ""
+    if edge.evidence is None:
+        return ""
+    confidence, views, residual = edge.evidence.confidence, edge.evidence.views, edge.evidence.residual_px
+    return f"confidence {confidence:.2f}, {amount(views, 'view')}, residual {residual:.2f} px"
 
 
 def refuse_empty(path, wireframe):

@@ -2,8 +2,12 @@
 
 ISO 10303-21 text of the schema of AP214, an edge-based wireframe (ISO 10303-501): each edge is an EDGE_CURVE between
 VERTEX_POINTs, those that meet are a CONNECTED_EDGE_SET. Its name is the kind, the index in `edges.json` and what the
-images say of it. STEP cannot do without a unit: the numbers are those of the input's frame, read as millimetres.
+images say of it. The numbers are those of the input's frame. It has no unit, but STEP cannot do without, and to kernels
+it matters: OpenCASCADE, for one, heals gaps of up to 1 mm, and so merges the corners of an object of that size. So they
+are metres, or whatever makes the object between a tenth of a metre and a hundred metres large.
 """
+
+import math
 
 import numpy as np
 
@@ -13,6 +17,8 @@ from taichi_edges.exporters.nurbs import DEGREE, joined
 
 SCHEMA = "AUTOMOTIVE_DESIGN { 1 0 10303 214 1 1 1 1 }"
 NO_DATE = "1970-01-01T00:00:00"  # the same edges give the same bytes
+SMALLEST, RANGE = 0.1, 1000.0  # the longest side of the edges' box in metres: from this to so many times this
+PREFIXES = (".MICRO.", ".MILLI.", "$", ".KILO.")  # of the metre, each RANGE times the one before
 UNCERTAINTY = 1e-6  # of the longest side of the edges' box: points closer than this are one
 HEADER = f"""ISO-10303-21;
 HEADER;
@@ -77,7 +83,8 @@ def write_step(path, wireframe):
     sets = [entities.add("CONNECTED_EDGE_SET", "", [edges[i] for i in part]) for part in connected_parts(wireframe)]
     model = entities.add("EDGE_BASED_WIREFRAME_MODEL", "edges", sets)
     origin = _add_placement(entities, np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]))
-    context = _add_context(entities, UNCERTAINTY * _longest_side(wireframe))
+    size = _longest_side(wireframe)
+    context = _add_context(entities, prefix_for(size), UNCERTAINTY * size)
     shape = entities.add("EDGE_BASED_WIREFRAME_SHAPE_REPRESENTATION", "edges", (origin, model), context)
     _add_product(entities, shape)
     return write_text(path, HEADER + "\n".join(entities.lines) + "\n" + FOOTER)
@@ -94,6 +101,12 @@ def connected_parts(wireframe):
                 for moved in parts[number]:
                     parts[moved] = other
     return [sorted(part) for number, part in enumerate(parts) if number == min(part)]
+
+
+def prefix_for(size):
+    """The prefix of the metre for edges of this size, units of the frame."""
+    steps = math.floor(math.log(max(size, 1e-300) / SMALLEST, RANGE))
+    return Token(PREFIXES[min(max(PREFIXES.index("$") - steps, 0), len(PREFIXES) - 1)])
 
 
 def _longest_side(wireframe):
@@ -171,10 +184,10 @@ CURVES = {
 }
 
 
-def _add_context(entities, uncertainty):
-    """The context of all geometry: three dimensions, millimetres, radians. uncertainty: mm."""
+def _add_context(entities, prefix, uncertainty):
+    """The context of all geometry: three dimensions, metres with a prefix, radians. uncertainty: in this unit."""
     unit = ("NAMED_UNIT", DERIVED)
-    length = entities.add_complex(("LENGTH_UNIT",), unit, ("SI_UNIT", Token(".MILLI."), Token(".METRE.")))
+    length = entities.add_complex(("LENGTH_UNIT",), unit, ("SI_UNIT", prefix, Token(".METRE.")))
     angle = entities.add_complex(unit, ("PLANE_ANGLE_UNIT",), ("SI_UNIT", UNSET, Token(".RADIAN.")))
     solid = entities.add_complex(unit, ("SI_UNIT", UNSET, Token(".STERADIAN.")), ("SOLID_ANGLE_UNIT",))
     measure = Token(f"LENGTH_MEASURE({encoded(uncertainty)})")
