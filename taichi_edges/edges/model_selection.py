@@ -113,7 +113,8 @@ def bent_shape(track, tolerance):
 
 def fitted_spline(track, tolerance, cubics):
     """The chain of some cubics through a Track."""
-    return Spline(fit_chain(track.points, track.ordering, tolerance, cubics)[0], track.closed)
+    whole = track if track.closed else _with_ends(track)
+    return Spline(fit_chain(whole.points, whole.ordering, tolerance, cubics)[0], track.closed)
 
 
 def fitted_line(track, tolerance):
@@ -168,6 +169,18 @@ def _round_ellipse(ellipse, track):
     before, after = 0.5 * (t[1] - t[0]), 0.5 * (t[-1] - t[-2])  # the places are the middles of what they stand for
     return (
         ellipse.over(t[0] - before, t[-1] + after) if LEAST_ROUND < t[-1] - t[0] + before + after < 2 * np.pi else None
+    )
+
+
+def _with_ends(track):
+    """The Track with one more place at each end, where the stretch that the outermost place stands for ends."""
+    (first, second), (before, last) = track.points[:2], track.points[-2:]
+    steps = 0.5 * track.share[[0, -1]]
+    ends = first - steps[0] * _unit(second - first), last + steps[1] * _unit(last - before)
+    return Track(
+        np.concatenate([ends[:1], track.points, ends[1:]]),
+        np.concatenate([[track.arc[0] - steps[0]], track.arc, [track.arc[-1] + steps[1]]]),
+        np.concatenate([[0.0], track.share, [0.0]]),
     )
 
 
