@@ -71,8 +71,30 @@ def describe_fit(facts):
 
 
 def describe_refine(facts):
-    """'33 edges that meet in 20 vertices'."""
-    return f"{amount(facts['edges'], 'edge')}, {amount(facts['vertices'], 'vertex', 'vertices')}"
+    """'33 edges, 20 vertices; 2 strokes joined to others; 71 parallel (refine.regularise: true makes them exact)'."""
+    found = f"{amount(facts['edges'], 'edge')}, {amount(facts['vertices'], 'vertex', 'vertices')}"
+    done = [
+        (facts["joined"], "stroke joined to others", "strokes joined to others"),
+        (facts["circles"], "circle completed", "circles completed"),
+        (facts["lines"], "line added", "lines added"),
+    ]
+    changed = ", ".join(amount(*each) for each in done if each[0])
+    return (
+        found
+        + (f"; {changed}" if changed else "")
+        + left_out((facts["duplicates"], "duplicate"), (facts["unsupported"], "edge that no image shows"))
+        + describe_relations(facts["relations"])
+    )
+
+
+def describe_relations(relations):
+    """'; 71 parallel, 3 coaxial (refine.regularise: true makes them exact)', '' where there are none."""
+    named = [f"{found} {kind.replace('_', ' ')}" for kind, (found, _) in relations.items() if found]
+    if not named:
+        return ""
+    imposed = sum(count for _, count in relations.values())
+    state = f"made exact by {imposed} of them" if imposed else "refine.regularise: true makes them exact"
+    return f"; {', '.join(named)} ({state})"
 
 
 def describe_evaluate(facts):

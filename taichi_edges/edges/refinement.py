@@ -1,6 +1,6 @@
 """From single edges to a wireframe: connected, minimal, in agreement with the images."""
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -8,28 +8,39 @@ import numpy as np
 from taichi_edges.edges.adjustment import adjusted
 from taichi_edges.edges.completion import completed
 from taichi_edges.edges.continuation import Merging, continued
-from taichi_edges.edges.evidence import claims_of, support_along, supported
+from taichi_edges.edges.evidence import claims_of, evidence_of, steadiness, support_along, support_of
 from taichi_edges.edges.extents import extended
 from taichi_edges.edges.junctions import connected
 from taichi_edges.edges.model_selection import Yardstick
+from taichi_edges.edges.regularities import found_relations, regularised
 from taichi_edges.kernels.edgel_matching import EdgelMatching
 
 NOISE_PX = 0.2  # by which a place on an edge may be off its shape, at least: next to other edges every detector is
 STRETCH_PX = 4.0  # length of an edge on which the errors go together
 WIDE_GAP_PX = 24.0  # between strokes that continue each other, where their ends are still free after the first pass
+MOST_COMPARED = (
+    150  # edges whose relations are looked for where nobody asked for them: their number grows as its square
+)
+LEAST_STEADY = 0.66  # share of the edgels about an edge that lie on it; contours have half
+LENIENT = 0.75  # of that, for edges that have not been adjusted
 LEAST_SUPPORTED = 0.33  # of the length of an edge; where edges touch, only one of them owns the edgels
 
 
 @dataclass(frozen=True)
 class RefineCounts:
-    """What the refinement did: circles completed, strokes joined to others, lines added between
-    vertices, and what was left out."""
+    """What the refinement did.
+
+    circles: arcs that became whole circles. joined: strokes that became part of others. duplicates: strokes that
+    repeated others. lines: added between vertices. unsupported: edges left out as the images do not show them.
+    relations: {kind: (how many were found, how many of these were imposed)}; what those imply is not imposed again.
+    """
 
     circles: int = 0
     joined: int = 0
     duplicates: int = 0
     lines: int = 0
     unsupported: int = 0
+    relations: dict = field(default_factory=dict)
 
 
 def refine_wireframe(loose, views, config):
@@ -40,30 +51,56 @@ def refine_wireframe(loose, views, config):
     if not config.enabled or not len(loose):
         return loose, RefineCounts()
     matching = EdgelMatching(views)
-    yardstick = Yardstick(NOISE_PX * matching.pixel, STRETCH_PX * matching.pixel)
-    seen, pixel = partial(support_along, matching), matching.pixel
-    shapes, first = continued(loose.shapes, yardstick, pixel, seen)
-    kept = with_support(matching, shapes)
-    shapes, second = continued(with_longer_ends(matching, kept), yardstick, pixel, seen, WIDE_GAP_PX)
-    wireframe, lines = completed(connected(with_support(matching, shapes), pixel), matching)
-    wireframe = adjusted(wireframe, matching)
+    shapes, merging, unsupported = whole_edges(loose.shapes, matching)
+    wireframe, lines = completed(connected(shapes, matching.pixel), matching)
+    wireframe, relations = related(adjusted(wireframe, matching), matching, config.regularise)
     judged = with_evidence(wireframe, matching)
-    counts = [getattr(first, name) + getattr(second, name) for name in Merging.__dataclass_fields__]
-    return judged, RefineCounts(*counts, lines, len(shapes) + lines - len(judged))
+    unsupported += len(wireframe) - len(judged)
+    return judged, RefineCounts(*astuple(merging), lines, unsupported, relations)
+
+
+def whole_edges(shapes, matching):
+    """The shapes of whole edges from those of strokes, Merging, and how many were left out for lack of support.
+
+    Free ends are extended only when it is known which are free, and then some more strokes continue each other.
+    """
+    pixel, seen = matching.pixel, partial(support_along, matching)
+    yardstick = Yardstick(NOISE_PX * pixel, STRETCH_PX * pixel)
+    shapes, first = continued(shapes, yardstick, pixel, seen)
+    kept = with_support(matching, shapes)
+    longer, second = continued(with_longer_ends(matching, kept), yardstick, pixel, seen, WIDE_GAP_PX)
+    found = with_support(matching, longer)
+    merging = Merging(*(sum(pair) for pair in zip(astuple(first), astuple(second), strict=True)))
+    return found, merging, len(shapes) - len(kept) + len(longer) - len(found)
+
+
+def related(wireframe, matching, impose):
+    """The Wireframe, with the relations that its edges have if these are to be imposed; and RefineCounts.relations."""
+    if impose:
+        return regularised(wireframe, matching)
+    if len(wireframe) > MOST_COMPARED:
+        return wireframe, {}
+    return wireframe, {kind: (count, 0) for kind, count in found_relations(wireframe, matching)[0].items()}
 
 
 def with_evidence(wireframe, matching):
-    """The Wireframe with what the images say about each edge, without those they do not support."""
-    found = supported(matching, wireframe.shapes)
-    edges = [replace(edge, evidence=of) for edge, of in zip(wireframe.edges, found, strict=True)]
-    kept = [edge.evidence.supported_length >= LEAST_SUPPORTED * edge.shape.length for edge in edges]
-    return replace(wireframe, edges=tuple(edges)).keep(np.array(kept, dtype=bool))
+    """The Wireframe with what the images say about each edge, and without those they do not support."""
+    support = support_of(matching, wireframe.shapes)
+    pairs = zip(wireframe.edges, evidence_of(support), strict=True)
+    edges = tuple(replace(edge, evidence=found) for edge, found in pairs)
+    return replace(wireframe, edges=edges).keep(is_edge(matching, support, wireframe.shapes, LEAST_STEADY))
 
 
 def with_support(matching, shapes):
-    """The shapes that the images support on a third of their length, at least."""
-    pairs = zip(shapes, supported(matching, shapes), strict=True)
-    return [shape for shape, found in pairs if found.supported_length >= LEAST_SUPPORTED * shape.length]
+    """The shapes that the images support; their places are not exact yet."""
+    kept = is_edge(matching, support_of(matching, shapes), shapes, LENIENT * LEAST_STEADY)
+    return [shape for shape, keep in zip(shapes, kept, strict=True) if keep]
+
+
+def is_edge(matching, support, shapes, steady):
+    """(E,) bool: enough of a shape is supported, and its edgels stay on it as the viewpoint moves."""
+    enough = support.supported_lengths >= LEAST_SUPPORTED * np.array([shape.length for shape in shapes])
+    return enough & (steadiness(matching, support) >= steady)
 
 
 def with_longer_ends(matching, shapes):
