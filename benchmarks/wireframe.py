@@ -285,10 +285,8 @@ def print_parts(options):
 def main(arguments=None):
     """Measure and print."""
     options = parse_arguments(arguments)
-    print(
-        f"{machine_line()}\n{options.threads} threads, preset fast; CPU s: processor time of all threads after the training",
-        flush=True,
-    )
+    print(f"{machine_line()}\n{options.threads} threads, preset fast")
+    print("CPU s: processor time of all threads, from the trained Gaussians on", flush=True)
     for name in options.scene or (() if options.hard else SCENES):
         print_ablation(name, options)
     if options.hard:
