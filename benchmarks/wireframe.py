@@ -30,6 +30,7 @@ from taichi_edges.edges.evidence import support_along
 from taichi_edges.edges.junctions import connected
 from taichi_edges.edges.model_selection import Yardstick
 from taichi_edges.edges.refinement import NOISE_PX, STRETCH_PX, refine_wireframe, whole_edges
+from taichi_edges.kernels.device import is_running
 from taichi_edges.kernels.edgel_matching import EdgelMatching
 from taichi_edges.pipeline import Run, run_stages
 from taichi_edges.scene_file import load_scene
@@ -207,8 +208,9 @@ def evaluated(run, wireframe, views):
 
 def trained(run):
     """The Run, prepared and trained unless it is already; the kernels of what follows are loaded."""
-    run_stages(run, until="train")
-    run_stages(run, start="cluster", until="refine")
+    record = run_stages(run, until="train")
+    if record["ran"] or not is_running(run.arch, run.threads):
+        run_stages(run, start="cluster", until="refine")
     return run
 
 
