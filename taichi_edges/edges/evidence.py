@@ -20,7 +20,9 @@ SPACING_PX = 0.5  # of the samples of an edge; edgels are about 1 px apart, so t
 MATCH_PX = 1.5  # an edgel within this distance is an edge's, if it is nobody else's
 TIE_PX = 0.1  # beyond its ends an edge must be nearer to an edgel than its neighbour is, by so much
 CHORDS = 64  # for each cubic: where places at equal distances along a shape are looked for
+CORE, CORE_ROUNDS = 3.0, 8  # standard deviations of the core; rounds in which it is found
 TIE_NOISES = 3.0  # of the noise: what cannot make the worse of two edges the nearer one
+ABOUT, MOST_ABOUT_PX = 6.0, 4.0  # of the distance at which an edgel is on an edge: it is about it; at most
 PLANES = 2  # those of two views always meet
 
 
@@ -140,13 +142,24 @@ class Support:
 
     @cached_property
     def noise_px(self):
-        """Standard deviation of the residuals of the best-supported fifth of the samples, px."""
+        """Standard deviation of the residuals of the best-supported fifth of the samples, px.
+
+        Of their core: close to other edges the tails are these.
+        """
         if not len(self.samples):
             return 0.0
         counts = (self.edgels >= 0).sum(axis=1)  # not the weights, which would choose small residuals
         best = counts >= np.quantile(counts, 1 - BEST_SUPPORTED)
-        residuals = self.residuals[best][self.edgels[best] >= 0]
-        return float(NOISE_PER_MEDIAN * np.median(np.abs(residuals))) if len(residuals) else 0.0
+        residuals = np.abs(self.residuals[best][self.edgels[best] >= 0])
+        noise = MATCH_PX
+        for _ in range(CORE_ROUNDS if len(residuals) else 0):
+            noise = float(NOISE_PER_MEDIAN * np.median(residuals[residuals <= max(CORE * noise, residuals.min())]))
+        return noise if len(residuals) else 0.0
+
+    @cached_property
+    def supported_lengths(self):
+        """(E,) length that LEAST_VIEWS views see, each counted by its weight."""
+        return self.samples.sums(self.samples.lengths * (self.views >= LEAST_VIEWS))
 
     @cached_property
     def residual_px(self):
@@ -182,21 +195,40 @@ def _owned(matching, samples, edgels, residuals, handicaps):
 
 
 def supported(matching, shapes):
-    """One Evidence for each shape: what the views say for and against it when every edgel supports one edge alone.
+    """One Evidence for each shape: what the views say for and against it when every edgel supports one edge alone."""
+    return evidence_of(support_of(matching, shapes))
+
+
+def evidence_of(support):
+    """One Evidence for each edge of a Support.
 
     `confidence` is the share of the length that is not there by chance (`Support.certainty`), times how well its edgels
     lie on it: 1 as far as the noise explains their distances, their mean square over that beyond.
     """
-    support = support_of(matching, shapes)
     samples, lengths = support.samples, support.samples.lengths
     total = np.maximum(samples.sums(lengths), 1e-300)
     seeing = (samples.sums(lengths[:, None] * (support.edgels >= 0)) >= 0.5 * total[:, None]).sum(axis=1)
-    length = samples.sums(lengths * (support.views >= LEAST_VIEWS))
     tight = max(TIGHT_PX, TIGHT_NOISES * support.noise_px)
     lying = (tight / np.maximum(support.residual_px, tight)) ** 2
     confidence = samples.sums(lengths * support.certainty) / total * lying
-    columns = zip(seeing, length, support.residual_px, confidence, strict=True)
+    columns = zip(seeing, support.supported_lengths, support.residual_px, confidence, strict=True)
     return [Evidence(int(views), *map(float, rest)) for views, *rest in columns]
+
+
+def steadiness(matching, support):
+    """(E,) share of the edgels about each edge that lie on it, of those that no other edge owns.
+
+    An edge stays where it is as the viewpoint moves. The occluding contour of a smooth surface leaves any line in
+    space, so that its edgels lie all around. matching: EdgelMatching. support: Support of the edges.
+    """
+    samples, tight = support.samples, max(TIGHT_PX, TIGHT_NOISES * support.noise_px)
+    about = min(ABOUT * tight, MOST_ABOUT_PX)
+    views = slice(0, matching.edgels.view_count)
+    edgels, residuals, _ = matching.matches(samples.points, samples.directions, views, about)
+    owners = np.append(support.claims.owners, len(samples.starts))[edgels]
+    mine = (edgels >= 0) & ((owners < 0) | (owners == samples.edges[:, None]))
+    on = mine & (np.abs(residuals) <= tight)
+    return samples.sums(on.sum(axis=1)) / np.maximum(samples.sums(mine.sum(axis=1)), 1)
 
 
 def claims_of(matching, shapes):

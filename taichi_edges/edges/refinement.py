@@ -8,7 +8,7 @@ import numpy as np
 from taichi_edges.edges.adjustment import adjusted
 from taichi_edges.edges.completion import completed
 from taichi_edges.edges.continuation import Merging, continued
-from taichi_edges.edges.evidence import claims_of, support_along, supported
+from taichi_edges.edges.evidence import claims_of, evidence_of, steadiness, support_along, support_of
 from taichi_edges.edges.extents import extended
 from taichi_edges.edges.junctions import connected
 from taichi_edges.edges.model_selection import Yardstick
@@ -21,6 +21,8 @@ WIDE_GAP_PX = 24.0  # between strokes that continue each other, where their ends
 MOST_COMPARED = (
     150  # edges whose relations are looked for where nobody asked for them: their number grows as its square
 )
+LEAST_STEADY = 0.66  # share of the edgels about an edge that lie on it; contours have half
+LENIENT = 0.75  # of that, for edges that have not been adjusted
 LEAST_SUPPORTED = 0.33  # of the length of an edge; where edges touch, only one of them owns the edgels
 
 
@@ -82,17 +84,23 @@ def related(wireframe, matching, impose):
 
 
 def with_evidence(wireframe, matching):
-    """The Wireframe with what the images say about each edge, without those they do not support."""
-    found = supported(matching, wireframe.shapes)
-    edges = [replace(edge, evidence=of) for edge, of in zip(wireframe.edges, found, strict=True)]
-    kept = [edge.evidence.supported_length >= LEAST_SUPPORTED * edge.shape.length for edge in edges]
-    return replace(wireframe, edges=tuple(edges)).keep(np.array(kept, dtype=bool))
+    """The Wireframe with what the images say about each edge, and without those they do not support."""
+    support = support_of(matching, wireframe.shapes)
+    pairs = zip(wireframe.edges, evidence_of(support), strict=True)
+    edges = tuple(replace(edge, evidence=found) for edge, found in pairs)
+    return replace(wireframe, edges=edges).keep(is_edge(matching, support, wireframe.shapes, LEAST_STEADY))
 
 
 def with_support(matching, shapes):
-    """The shapes that the images support on a third of their length, at least."""
-    pairs = zip(shapes, supported(matching, shapes), strict=True)
-    return [shape for shape, found in pairs if found.supported_length >= LEAST_SUPPORTED * shape.length]
+    """The shapes that the images support; their places are not exact yet."""
+    kept = is_edge(matching, support_of(matching, shapes), shapes, LENIENT * LEAST_STEADY)
+    return [shape for shape, keep in zip(shapes, kept, strict=True) if keep]
+
+
+def is_edge(matching, support, shapes, steady):
+    """(E,) bool: enough of a shape is supported, and its edgels stay on it as the viewpoint moves."""
+    enough = support.supported_lengths >= LEAST_SUPPORTED * np.array([shape.length for shape in shapes])
+    return enough & (steadiness(matching, support) >= steady)
 
 
 def with_longer_ends(matching, shapes):
