@@ -11,7 +11,8 @@ import numpy as np
 ROUNDS = 4  # owners whose own support turns out weak lose their edgels in the next round
 MATCH_PX = 1.0  # a point explains an edgel within this distance
 NEAR_PX = 3.0  # an edgel within this distance, and nobody else's, should lie on the point if that is on an edge
-BESIDE_PX, ALONG_PX = 2.0, 8.0  # a point so near to the owner, across and along its direction, is on the same edge
+ALONG_PX = 8.0  # a point so near to the owner along its direction is on the same edge, and so near across it:
+BESIDE_PX, BESIDE_NOISES = 1.0, 7.0  # the first, or so many times the maps' noise; other edges may be 1.5 px beside
 TIGHT_PX, TIGHT_NOISES = 0.25, 2.0  # residuals of an edge: within the first, or within so many times the maps' noise
 BEST_SUPPORTED = 0.2  # share of the points whose residuals tell the noise; those of stray points and contours do not
 LEAST_USUAL = 0.3  # steadiness; where the best points have less, there is nothing to compare with
@@ -26,12 +27,23 @@ class Explained:
     support: (n,) share of the views that have a point in the image in which it lies on an edgel of its own edge.
     steadiness: (n,) of the edgels near a point's projections that no other edge explains, the share that lies on them;
     relative to that of the best-supported points, which is below 1 as much as the edgels are noisy.
+    spread: (n,) that of the RefinedPoints: from how different directions they are seen.
     noise_px: standard deviation across the edge of the edgels of the best-supported points.
     """
 
     support: np.ndarray
     steadiness: np.ndarray
+    spread: np.ndarray
     noise_px: float
+
+    @property
+    def tight_px(self):
+        """Residual up to which an edgel lies on an edge."""
+        return max(TIGHT_PX, TIGHT_NOISES * self.noise_px)
+
+    def keep(self, chosen):
+        """What is said about the chosen points only. chosen: (n,) bool or indices."""
+        return Explained(self.support[chosen], self.steadiness[chosen], self.spread[chosen], self.noise_px)
 
 
 def explain(matching, refined):
@@ -41,18 +53,24 @@ def explain(matching, refined):
     same edge in 3D, shares it. Strength is the support, then what a point was found to own in the round before.
     """
     owned, count = refined.support, len(refined)
+    beside = max(BESIDE_PX, BESIDE_NOISES * _noise(matching, refined.keep(_best(owned))))
     for _ in range(ROUNDS):
         owners = _owners(matching, refined, owned + 1e-3 * refined.support)
         shared, seen = np.zeros(count), np.zeros(count)
         for some, matches, _, inside in _in_parts(matching, refined, MATCH_PX):
-            shared += (_whose(matching, refined, owners, some, matches) > 0).sum(axis=1)
+            shared += (_whose(matching, refined, owners, some, matches, beside) > 0).sum(axis=1)
             seen += inside.sum(axis=1)
         owned = shared / np.maximum(seen, 1)
-    best = owned >= np.quantile(owned, 1 - BEST_SUPPORTED) if count else np.zeros(0, bool)
+    best = _best(owned)
     noise = _noise(matching, refined.keep(best))
-    steadiness = _steadiness(matching, refined, owners, max(TIGHT_PX, TIGHT_NOISES * noise))
+    steadiness = _steadiness(matching, refined, owners, max(TIGHT_PX, TIGHT_NOISES * noise), beside)
     usual = max(float(np.median(steadiness[best])), LEAST_USUAL) if count else 1.0
-    return Explained(owned, steadiness / usual, noise)
+    return Explained(owned, steadiness / usual, refined.spread, noise)
+
+
+def _best(support):
+    """(n,) bool: the best-supported points."""
+    return support >= np.quantile(support, 1 - BEST_SUPPORTED) if len(support) else np.zeros(0, bool)
 
 
 def unexplained(matching, refined):
@@ -81,8 +99,11 @@ def _owners(matching, refined, strength):
     return np.append(order, -1)[best]
 
 
-def _whose(matching, refined, owners, some, matches):
-    """(n, v) int: 1 where the matched edgel is the point's own, -1 where it is another edge's, 0 no edgel or owner."""
+def _whose(matching, refined, owners, some, matches, beside):
+    """(n, v) int: 1 where the matched edgel is the point's own, -1 where it is another edge's, 0 no edgel or owner.
+
+    beside: px; so far across its direction another point is on the same edge.
+    """
     whose = np.zeros(matches.shape, np.int8)
     at, column = np.nonzero(matches >= 0)
     owner = owners[matches[at, column]]
@@ -90,7 +111,7 @@ def _whose(matching, refined, owners, some, matches):
     apart, direction = refined.points[owner] - refined.points[at], refined.directions[at]
     along = (apart * direction).sum(axis=1)
     across = np.linalg.norm(apart - along[:, None] * direction, axis=1)
-    reach = matching.pixel * np.array([BESIDE_PX, ALONG_PX])
+    reach = matching.pixel * np.array([beside, ALONG_PX])
     whose[at, column] = np.where((across <= reach[0]) & (np.abs(along) <= reach[1]), 1, -1)
     return whose
 
@@ -102,11 +123,11 @@ def _noise(matching, best):
     return float(NOISE_PER_MEDIAN * np.median(np.abs(residuals))) if len(residuals) else 0.0
 
 
-def _steadiness(matching, refined, owners, tight):
-    """(n,) see Explained, not yet relative. tight: px."""
+def _steadiness(matching, refined, owners, tight, beside):
+    """(n,) see Explained, not yet relative. tight, beside: px."""
     on, near = np.zeros(len(refined)), np.zeros(len(refined))
     for some, matches, residuals, _ in _in_parts(matching, refined, NEAR_PX):
-        counted = (matches >= 0) & (_whose(matching, refined, owners, some, matches) >= 0)
+        counted = (matches >= 0) & (_whose(matching, refined, owners, some, matches, beside) >= 0)
         near += counted.sum(axis=1)
         on += (counted & (np.abs(residuals) <= tight)).sum(axis=1)
     return on / np.maximum(near, 1)

@@ -184,7 +184,10 @@ class FilterConfig(Section):
     )
     refine: bool = Field(False, description="move points to where the viewing planes of their edgels meet")
     min_steadiness: Share = Field(
-        0.72, description="refine: share of the unexplained edgels near an edge that lie on it, relative to sure edges"
+        0.54, description="refine: share of the unexplained edgels near a point that lie on it, relative to sure edges"
+    )
+    min_evidence: NotNegative = Field(
+        1.5, description="refine: that an edge is no passing contour, log likelihood ratio from its views"
     )
     harvest: bool = Field(True, description="refine: look once more for edges seen in few views")
     grow: Share = Field(0.2, description="refine: continue edges where this share of the views agrees; 0: do not")

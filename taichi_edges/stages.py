@@ -255,7 +255,8 @@ def _write_csv(path, rows):
 def cluster(run):
     """`gaussians.ply`, `views.npz` -> `points.ply` (filtered oriented points, input frame) and `clusters.npz`."""
     from taichi_edges.edges.assembly import assemble
-    from taichi_edges.edges.filtering import FEW_VIEWS, LEAST_VIEWS, drop_contours, filter_points
+    from taichi_edges.edges.contours import without_contours
+    from taichi_edges.edges.filtering import FEW_VIEWS, LEAST_VIEWS, filter_points
     from taichi_edges.exporters.point_cloud import write_oriented_points
     from taichi_edges.exporters.splats import read_gaussians
     from taichi_edges.kernels.device import is_running, start_taichi
@@ -267,7 +268,7 @@ def cluster(run):
     gaussians = Gaussians(*read_gaussians(run.path("gaussians.ply")))
     means = views.similarity.to_unit(gaussians.means.astype(np.float64))
     threshold, generator = run.config.train.edge_threshold, np.random.default_rng(run.config.seed)
-    points, directions, steadiness, counts = filter_points(
+    points, directions, explained, counts = filter_points(
         means, gaussians.directions(), gaussians.opacities, views, run.config.filter, threshold, generator
     )
     if len(points) == 0:
@@ -278,8 +279,7 @@ def cluster(run):
             cure = f"{len(views)} views are too few, {seen}: take more, or set filter.refine: false"
         raise UserError(f"{run.path('gaussians.ply')}: {problem}; {cure}")
     found = assemble(points, directions, run.config.cluster)
-    labels, contours = drop_contours(found.labels, steadiness, run.config.filter.min_steadiness)
-    found = found.keep(np.isin(np.arange(len(found.arcs)), found.labels[labels >= 0]))
+    found, contours = without_contours(found, points, directions, explained, views, run.config.filter.min_evidence)
     labels = found.labels
     write_oriented_points(run.path("points.ply"), views.similarity.to_input(points), directions, labels)
     with replacing(run.path("clusters.npz")) as unfinished, open(unfinished, "wb") as file:

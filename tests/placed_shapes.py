@@ -18,7 +18,8 @@ class Placing:
         self.middle = 0.5 + generator.uniform(-0.05, 0.05, 3)
 
     def __call__(self, points):
-        return self.scale * np.asarray(points, dtype=np.float64) @ self.rotation + self.middle
+        points = self.scale * np.asarray(points, dtype=np.float64)
+        return (points[:, None] * self.rotation).sum(axis=2) + self.middle  # equal points stay equal, unlike those of @
 
 
 def any_shape(kind, generator):
@@ -27,7 +28,7 @@ def any_shape(kind, generator):
     radius, low = generator.uniform(0.05, 0.2), generator.uniform(-4, 4)
     angle = generator.uniform(0.3, 3.0) if not kind.startswith("long") else generator.uniform(3.3, 6.0)
     if kind == "line":
-        return Line(place(generator.uniform(-0.2, 0.2, (2, 3))))
+        return Line(place([[0.0, 0, 0], [generator.uniform(0.1, 0.3), 0, 0]]))
     if kind in ("arc", "long_arc", "circle"):
         arc = EllipticArc(np.zeros(3), radius * PLANE, low, low + (2 * np.pi if kind == "circle" else angle))
         return arc.transformed(place)
@@ -37,11 +38,12 @@ def any_shape(kind, generator):
     return Spline(place(smooth_chain(kind == "loop", generator).reshape(-1, 3)).reshape(-1, 4, 3), kind == "loop")
 
 
-def smooth_chain(closed, generator, count=3):
-    """(count, 4, 3) cubics with a continuous tangent through random points."""
-    knots = np.cumsum(generator.uniform(0.02, 0.1, (count + 1, 3)), axis=0)
-    slopes = generator.uniform(0.01, 0.05, (count + 1, 3))
-    if closed:
-        knots[-1], slopes[-1] = knots[0], slopes[0]
-    starts, ends = knots[:-1], knots[1:]
+def smooth_chain(closed, generator, count=4):
+    """(count, 4, 3) cubics with a continuous tangent through random points of a wave, or of a wavy round (Catmull)."""
+    place = np.arange(-1, count + 2)
+    turn = 2 * np.pi * (place % count) / count
+    round = np.stack([np.cos(turn), np.sin(turn), generator.uniform(-0.3, 0.3, count)[place % count]])
+    wave = np.stack([np.pi * place / count, *generator.uniform(-0.4, 0.4, (2, count + 3))])
+    knots = generator.uniform(0.05, 0.1) * (round if closed else wave).T
+    starts, ends, slopes = knots[1:-2], knots[2:-1], (knots[2:] - knots[:-2]) / 6
     return np.stack([starts, starts + slopes[:-1], ends - slopes[1:], ends], axis=1)

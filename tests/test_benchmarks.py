@@ -17,7 +17,11 @@ from benchmarks.log_plot import log_ticks, tick_text
 from benchmarks.markdown import significant, table
 from benchmarks.scaling import slopes
 from benchmarks.view_step import PARTS, DumpedStep, part_of
+from benchmarks.wireframe import STEP_COLUMNS, STEPS, cells, measure_part, scene_path
+from benchmarks.wireframe import main as ablate
 from taichi_edges.cameras import project
+from taichi_edges.pipeline import Run
+from taichi_edges.scene_file import load_scene
 from taichi_edges.splatting.gaussians import Gaussians
 
 ROOT = Path(__file__).parent.parent
@@ -115,6 +119,27 @@ def test_scaling_prints_points_and_draws(run, tmp_path):
 
 def test_scripts_are_modules_too(run):
     assert "usage: python benchmarks/splat.py" in run("-m", "benchmarks.splat", "--help")
+
+
+def test_wireframe_adds_step_by_step_what_the_stages_do(tmp_path, capsys):
+    scene = tmp_path / "tiny.yaml"
+    scene.write_text("source: {reader: synthetic, part: block, views: 12, size: 120, detector: subpixel}\n")
+    ablate([str(scene), "--out", str(tmp_path), "--threads", "2"])
+    (rows,) = read_tables(capsys.readouterr().out)
+    assert [row["step"] for row in rows] == [step.name for step in STEPS]
+    assert set(rows[0]) == {"step", *STEP_COLUMNS}
+    assert all(row["edges (true)"].endswith("(12)") and float(row["CPU s"]) > 0 for row in rows)
+    closed = {row["step"]: float(row["corners closed %"]) for row in rows}
+    assert closed["+ merging"] == 0 and closed["+ harvest: the default"] > 80  # loose ends close nothing
+    default = measure_part(Run(load_scene(scene), tmp_path / "tiny", threads=2))
+    assert list(rows[-1].values())[1:-1] == cells(default, STEP_COLUMNS)[:-1]
+
+
+def test_wireframe_names_scenes_it_has_no_data_for(monkeypatch, capsys):
+    monkeypatch.delenv("TAICHI_EDGES_DATA", raising=False)
+    ablate(["cad_plate"])
+    assert "Skipped cad_plate: source.path: cad/plate is relative" in capsys.readouterr().out
+    assert scene_path("demo").is_file() and scene_path("here/mine.yaml") == Path("here/mine.yaml")
 
 
 # Their rooms --------------------------------------------------------------------------------------------------------

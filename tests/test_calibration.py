@@ -24,7 +24,14 @@ from taichi_edges.detectors.offsets import _solve as solve
 from taichi_edges.detectors.ridges import trace_ridges
 from taichi_edges.synthetic.drawing import Imperfections, draw_edge_map
 from taichi_edges.synthetic.parts import PARTS
-from taichi_edges.synthetic.rendering import SAMPLE_PX, camera_centre, pixel_size, render_picture, ring_cameras
+from taichi_edges.synthetic.rendering import (
+    SAMPLE_PX,
+    camera_centre,
+    pixel_size,
+    render_edge_maps,
+    render_picture,
+    ring_cameras,
+)
 from taichi_edges.synthetic.visibility import ray_scene, sample_contours, sample_edges, visible_from
 from taichi_edges.views import Views
 
@@ -146,7 +153,7 @@ def test_planted_shift_and_offset_are_found_and_corrected(part, generator, image
     assert np.median(true_errors(part, edgels)) > 0.5
     assert np.median(true_errors(part, corrected)) < 0.1
     assert np.nanmedian(np.abs(found.residuals)) < 0.1
-    assert np.isfinite(found.residuals).mean() > 0.5
+    assert np.isfinite(found.residuals).mean() > 0.45  # points that few of the twelve views see explain nothing
 
 
 def test_with_images_the_rims_of_through_holes_are_corrected_too(part, generator):
@@ -215,6 +222,68 @@ def test_errors_through_points_cover_cameras_that_are_a_little_wrong(part, gener
     assert np.abs(found.shift_error).max() < 0.4 and found.silhouette_error < 0.2
     assert (np.abs(found.shift - SHIFT) < 4 * found.shift_error).all()
     assert abs(found.silhouette - OFFSET) < 4 * found.silhouette_error
+
+
+def unbiased(name, generator, views=12, size=300, smooth=0):
+    """Views of a part's edge maps, contours and imperfections included but no bias; their edgels; seeds on the edges.
+
+    smooth: number of further seeds, on lines along smooth surfaces, as contours make them.
+    """
+    solid, cameras = PARTS[name](), ring_cameras(views, size)
+    pixel = pixel_size(*cameras)
+    maps = render_edge_maps(solid, *cameras, size, Imperfections(), generator)
+    edges = sample_edges(solid, SAMPLE_PX * pixel)
+    chosen, directions = along_chains(edges, every=10)
+    points = edges.points[chosen]
+    if smooth:
+        ends = solid.vertices[solid.mesh_edges.ends[~solid.mesh_edges.sharp]]
+        along = ends[:, 1] - ends[:, 0]
+        lengths = np.linalg.norm(along, axis=1)
+        some = generator.choice(np.flatnonzero(lengths > 5 * pixel), smooth)
+        points = np.concatenate([points, ends[some, 0] + generator.random((smooth, 1)) * along[some]])
+        directions = np.concatenate([directions, along[some] / lengths[some, None]])
+    points = points + generator.normal(0, SEED_NOISE * pixel, points.shape)
+    found = Views(tuple(map(str, range(views))), maps, *cameras, ("",) * views)
+    return found, trace_ridges(maps, Imperfections().width_px, 0.3), points, directions
+
+
+def test_chance_pairs_between_thin_bars_are_no_bias(generator):
+    # Bars of 3 px, whose lines blend: nearly all points have one or two edgels, with which they agree to nothing.
+    views, edgels, *seeds = unbiased("frame", generator)
+    corrected, found = calibrate(views, edgels, *seeds)
+    assert not found.shift_applied and not found.silhouette_applied
+    np.testing.assert_array_equal(corrected.points, edgels.points)
+
+
+def test_contours_of_a_slim_shaft_are_no_bias(generator):
+    # Seen from anywhere a contour lies the radius, some pixels, outside the axis.
+    views, edgels, *seeds = unbiased("shaft", generator, size=400, smooth=1000)
+    corrected, found = calibrate(views, edgels, *seeds)
+    assert not found.shift_applied and not found.silhouette_applied
+    np.testing.assert_array_equal(corrected.points, edgels.points)
+
+
+def test_images_that_show_other_edges_than_the_maps_say_nothing(part, generator):
+    views, edgels = planted(part, SHIFT, OFFSET)
+    assert calibrate(views, edgels, *seeds(part, generator))[1].shift_method == "images"
+    scattered = edgels.moved(generator.normal(0, 1.5, (len(edgels), 2)))
+    _, found = calibrate(views, scattered, *seeds(part, generator))
+    assert "images" not in (found.shift_method, found.silhouette_method)
+
+
+@pytest.mark.parametrize("leaked", [0, 3])
+def test_silhouettes_of_views_whose_background_leaked_do_not_count(part, generator, leaked):
+    values, views, edgels = np.array([OFFSET, *SHIFT]), *planted(part, images=False)
+    points, directions = seeds(part, generator)
+    consensus = Consensus(views, edgels, sides_of(views, edgels), points, directions)
+    observations = observations_of(generator, 20000, 400, values, np.zeros((400, 2)), 0.1)
+    inside = (observations.views < leaked) & (observations.silhouette > 0)
+    observations.offsets[inside] -= OFFSET
+    observations = observations.keep(observations.views < VIEWS)
+    kept = consensus._without_odd_views(observations, UNKNOWN)
+    np.testing.assert_array_equal(np.unique(kept.views[kept.silhouette > 0]), np.arange(leaked, VIEWS))
+    assert (kept.silhouette == 0).sum() == (observations.silhouette == 0).sum()
+    np.testing.assert_allclose(fit_offsets(kept, UNKNOWN, len(consensus.points)).values, values, atol=0.03)
 
 
 def test_maps_without_edges_are_no_problem(part, generator):

@@ -89,9 +89,10 @@ def test_polyline_runs_from_end_to_end_along_the_shape(shape):
     points = polyline(shape, chords=16)
     np.testing.assert_allclose(points[[0, -1]], shape.ends, atol=1e-15)
     assert len(points) == (2 if shape.kind == "line" else 16 * len(shape.cubics()) + 1)
-    # Chords of a sixteenth of a quarter round are (pi / 32)^2 / 24 = 4e-4 shorter; the random chains turn sharply.
+    # Chords of a sixteenth of a quarter round are (pi / 32)^2 / 24 = 4e-4 shorter, at the sharp end of an ellipse four
+    # times as much; the random chains turn sharply.
     length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
-    assert length == pytest.approx(shape.length, rel=0.02 if shape.kind == "spline" else 5e-4)
+    assert length == pytest.approx(shape.length, rel=0.02 if shape.kind == "spline" else 2e-3)
 
 
 @pytest.mark.parametrize("kind", ["line", "arc", "elliptic_arc"])

@@ -17,7 +17,7 @@ from edgel_scenes import (
 )
 
 from taichi_edges.edgels import Edgels
-from taichi_edges.edges.filtering import drop_contours, filter_points, judge
+from taichi_edges.edges.filtering import filter_points, judge
 from taichi_edges.edges.growing import grow_points
 from taichi_edges.explaining import explain, unexplained
 from taichi_edges.kernels.edgel_matching import CELL, EdgelMatching
@@ -204,7 +204,7 @@ def test_a_contour_is_not_steady_and_an_edge_is(taichi, generator):
     assert explained.noise_px == pytest.approx(0.05, abs=0.03)
     assert np.median(explained.steadiness[:200]) > 0.9
     assert np.median(explained.steadiness[200:]) < 0.6
-    supported, steady, _ = judge(matching, refined, FilterConfig(refine=True, min_steadiness=0.72))
+    supported, steady, _ = judge(matching, refined, FilterConfig(refine=True))
     assert supported[:200].all() and steady[:200].mean() > 0.95
     assert steady[200:].mean() < 0.3
 
@@ -254,10 +254,10 @@ def test_filter_refines_keeps_edges_and_drops_strays(taichi, generator):
     opacities = np.full(len(means), 0.9)
     opacities[:50] = 0.1
     config = FilterConfig(refine=True, harvest=False, grow=0.0, outlier_neighbors=0)
-    points, along, steadiness, counts = filter_points(means, directions, opacities, views, config, 0.5, generator)
+    points, along, explained, counts = filter_points(means, directions, opacities, views, config, 0.5, generator)
     off = np.min([distances_to(curve, points) for curve in curves], axis=0)
     assert np.median(off) < 0.1 * pixel_of(views) and (off < pixel_of(views)).mean() > 0.99
-    assert len(points) == len(along) == len(steadiness) > 0.9 * (900 - 50)
+    assert len(points) == len(along) == len(explained.steadiness) > 0.9 * (900 - 50)
     assert counts.gaussians == len(means) and counts.low_opacity == 50
     assert len(points) == counts.gaussians - counts.low_opacity - counts.low_support - counts.unsteady
 
@@ -279,14 +279,6 @@ def test_harvest_finds_an_edge_that_few_views_see(taichi, generator):
     on_rare = {harvest: (distances_to(rare, result[0]) < pixel_of(views)).sum() for harvest, result in found.items()}
     assert on_rare[False] == 0 and on_rare[True] > 30
     assert found[True][3].harvested > 0
-
-
-def test_clusters_that_are_not_steady_are_dropped():
-    labels = np.array([0, 0, 1, 1, 2, -1])
-    kept, dropped = drop_contours(labels, np.array([1.0, 0.8, 0.5, 0.6, 0.9, 0.1]), 0.72)
-    np.testing.assert_array_equal(kept, [0, 0, -1, -1, 1, -1])
-    assert dropped == 1
-    assert drop_contours(np.array([-1, -1]), np.ones(2), 0.72)[1] == 0
 
 
 def test_what_few_views_see_must_be_seen_from_different_directions(taichi, generator):

@@ -13,7 +13,13 @@ import numpy as np
 
 from taichi_edges.detectors.backgrounds import CLEAR, Sides, look_beside
 from taichi_edges.detectors.consensus import Consensus
-from taichi_edges.detectors.offsets import LEAST_OBSERVATIONS, Estimate, fit_offsets, standard_errors
+from taichi_edges.detectors.offsets import (
+    LEAST_OBSERVATIONS,
+    MOST_RESIDUAL,
+    Estimate,
+    fit_offsets,
+    standard_errors,
+)
 from taichi_edges.support import line_width
 
 SURE, WORTH_PX = 3.0, 0.1  # a bias is corrected from so many standard errors and so many pixels on
@@ -98,16 +104,15 @@ def calibrate(views, edgels, points, directions, fixed_shift=None, fixed_silhoue
     sides = sides_of(views, edgels, threads)
     consensus = Consensus(views, edgels, sides, points, directions, threads)
     by_images = _by_images(sides, edgels, known)
-    by_points, reason = consensus.estimate(known, np.zeros(3) if by_images is None else by_images.values)
+    by_points, reason = _by_points(consensus, by_images, known)
     estimates = [estimate for estimate in (by_images, by_points) if estimate is not None]
     silhouette, shift = (_choose(part, known, estimates) for part in (slice(0, 1), slice(1, 3)))
     values = np.concatenate([silhouette.applied_values, shift.applied_values])
     corrected, on_silhouette = sides.correct(edgels, values)
-    residuals = np.full(len(edgels), np.nan) if reason else consensus.residuals(values)
     return corrected, Calibration(
         *(shift.values, shift.errors, shift.method, shift.applied),
         *(float(silhouette.values[0]), float(silhouette.errors[0]), silhouette.method, silhouette.applied),
-        *(residuals, on_silhouette, sides.outward, reason),
+        *(consensus.residuals(values), on_silhouette, sides.outward, reason),
     )
 
 
@@ -124,7 +129,7 @@ def sides_of(views, edgels, threads=None):
 
 
 def _by_images(sides, edgels, known):
-    """Estimate against the colour images; None where they show too little."""
+    """Estimate against the colour images; None where they show too little, or other edges."""
     shift = np.where(np.isnan(known[1:]), 0.0, known[1:])
     for _ in range(2):  # which edgels are on silhouettes is known better when the shift is
         observations = sides.observations(edgels.views, shift)
@@ -132,7 +137,25 @@ def _by_images(sides, edgels, known):
             return None
         fit = fit_offsets(observations, known)
         shift = fit.values[1:]
+    if np.median(np.abs(fit.residuals)) > MOST_RESIDUAL:
+        return None
     return Estimate(fit.values, standard_errors(observations, fit, known), "images")
+
+
+def _by_points(consensus, by_images, known):
+    """Estimate through 3D points, or None, and then why, or ''.
+
+    Where the cameras stand alike a shift is hard to tell from a displacement of all points, which takes the silhouettes
+    with it; so a shift that the images tell surely is not measured again.
+    """
+    if by_images is None:
+        return consensus.estimate(known, np.zeros(3))
+    sure = np.linalg.norm(by_images.errors[1:]) <= WORTH_PX
+    given = np.append(known[0], by_images.values[1:] if sure else known[1:])
+    found, reason = consensus.estimate(given, by_images.values)
+    if found is None or not sure:
+        return found, reason
+    return Estimate(found.values, np.append(found.errors[0], by_images.errors[1:]), found.method), reason
 
 
 @dataclass(frozen=True)

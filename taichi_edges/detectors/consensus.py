@@ -8,6 +8,8 @@ from taichi_edges.cameras import NEAR, inside_image
 from taichi_edges.detectors.backgrounds import CLEAR
 from taichi_edges.detectors.offsets import (
     LEAST_OBSERVATIONS,
+    MOST_RESIDUAL,
+    NORMAL_MAD,
     Estimate,
     Observations,
     camera_leverage,
@@ -19,13 +21,25 @@ from taichi_edges.views import pixel_size
 LEAST_POINTS, MOST_POINTS = 50, 3000  # fewer are no use; more only cost time: each is seen by most of the views
 REACHES = (5.0, 3.0)  # px around a 3D point within which an edgel may be its, round by round
 FARTHEST_PX = 3.0  # that a point is moved in one round
-MOST_SILHOUETTE = 0.85  # of a point's observations; with more it cannot tell its own displacement from their offset
+# Two edgels place a point whatever they are, and it would agree with them to nothing: what few views see, as between
+# bars whose lines blend in most views, is chance, and makes the rest look better than it is.
+LEAST_REDUNDANT = 3  # edgels of a point
+LEAST_SEEN, LEAST_SEEN_SHARE = 5, 0.2  # and views, and share of all of them, that see a point which measures biases
+# Silhouettes are held against points that so many edgels inside place. A point on the occluding contour of a slim shaft
+# is on silhouettes in all views; its displacement and their offset cannot be told apart.
+LEAST_INSIDE = LEAST_REDUNDANT
+MOST_SILHOUETTE = 0.85  # of a point's observations; a few chance edgels inside do not place what is a contour
+# A flood that leaks through a gap of an outline makes silhouettes of edges that are none, many of them in one view.
+ODD_PX = 0.5  # px by which the silhouettes of a view lie, in the median, farther out or in than those of the others
+LEAST_IN_VIEW = 10  # silhouettes of which a median is taken
+# Contours move over the surface with the viewpoint.
+STEADY_SHARE = 2 / 3  # of a point's silhouettes, and of its edgels inside, that agree with it
+AGREEING_PX, AGREEING_SCALES = 0.5, 3.0  # px, and standard deviations of the residuals, to which edgels agree
 # Standard errors through 3D points, of the outward offset and the shift's coordinates, for each px of median residual,
 # that no leaving out of observations shows: interior edges have small biases of their own, which points on them take
 # over. On exact CAD models, with residuals of 0.17 px, the offset came out wrong by 0.17 px and the shift by 0.08.
 OWN_ERRORS = np.array([0.6, 0.4, 0.4])
 CAMERA_ERROR = 0.1  # px; cameras are not known better, whatever the residuals say
-MOST_RESIDUAL = 0.35  # px, median; where views agree no better, as on textured photographs, chance has made the pairs
 WALK, STEP = 8.0, 1.0  # px to each side of a projection that are looked at; lines in an edgel table are two px or more
 SAME_LINE = 2.5  # px; edgels farther apart across the edge are of two lines
 ALIGNED = np.cos(np.radians(20.0))  # an edgel runs along the projection of its point's line, to that angle
@@ -52,15 +66,22 @@ class Consensus:
             return None, f"{len(self.points)} 3D points are too few to calibrate with; {LEAST_POINTS} are needed"
         values = np.where(np.isnan(known), start, known)
         for reach in REACHES:
-            observations = self.observe(values, reach)
+            observations = self._well_seen(self.observe(values, reach))
             if len(observations) < LEAST_OBSERVATIONS:
                 return None, f"3D points explain only {len(observations)} edgels; {LEAST_OBSERVATIONS} are needed"
             fit = fit_offsets(observations, known, len(self.points))
             self._move(fit)
             values = fit.values
-        observations = self._balanced(self.observe(values, REACHES[-1]))
-        if len(observations) < LEAST_OBSERVATIONS:
-            return None, "nearly all 3D points are on silhouettes only"
+        observations = self._balanced(self._well_seen(self.observe(values, REACHES[-1])))
+        if len(observations) >= LEAST_OBSERVATIONS:
+            observations = self._without_odd_views(observations, known)
+            observations = self._steady(observations, fit_offsets(observations, known, len(self.points)))
+        if len(observations) < LEAST_OBSERVATIONS or len(np.unique(observations.owners)) < LEAST_POINTS:
+            return None, "nearly all 3D points are on silhouettes only, or not steady"
+        return self._weighed(observations, known)
+
+    def _weighed(self, observations, known):
+        """Estimate from the observations, or None, and then why, or ''."""
         fit = fit_offsets(observations, known, len(self.points))
         residual = np.median(np.abs(fit.residuals))
         if residual > MOST_RESIDUAL:
@@ -94,14 +115,16 @@ class Consensus:
     def residuals(self, values):
         """(n,) px from the 3D point that explains an edgel to it, without the biases, outward; NaN where none does.
 
-        The points are moved to fit those biases first. A point explains the edgel that is its own, and those next to
-        it along the line.
+        The points are moved to fit those biases first. A point with edgels to spare explains those that are its own,
+        and those next to them along the line.
         """
-        observations = self.observe(values, REACHES[-1])
-        if len(observations):
-            self._move(fit_offsets(observations, values, len(self.points)))
+        observations = self._redundant(self.observe(values, REACHES[-1]))
+        if len(observations) < LEAST_OBSERVATIONS:
+            return np.full(len(self.edgels), np.nan)
+        self._move(fit_offsets(observations, values, len(self.points)))
         corrected, _ = self.sides.correct(self.edgels, values)
-        return np.concatenate(self._for_each_view(lambda view: self._residuals_in(view, corrected)))
+        placed = self._counts(observations) > 0
+        return np.concatenate(self._for_each_view(lambda view: self._residuals_in(view, corrected, placed)))
 
     def _for_each_view(self, look):
         with ThreadPoolExecutor(self.threads) as pool:  # NumPy releases the lock in the long loops
@@ -111,17 +134,57 @@ class Consensus:
         moves = np.clip(fit.displacements, -FARTHEST_PX, FARTHEST_PX)
         self.points = self.points + self.pixel * np.einsum("nk,nkj->nj", moves, self.across)
 
+    def _redundant(self, observations, least=LEAST_REDUNDANT):
+        """The observations of points that have at least so many."""
+        return observations.keep((self._counts(observations) >= least)[observations.owners])
+
+    def _well_seen(self, observations):
+        """The observations of points that enough views see to tell biases."""
+        return self._redundant(observations, max(LEAST_SEEN, LEAST_SEEN_SHARE * len(self.views)))
+
     def _balanced(self, observations):
         """The observations of points that are seen inside often enough."""
-        counts = np.bincount(observations.owners, minlength=len(self.points))
-        silhouettes = np.bincount(observations.owners, observations.silhouette, len(self.points))
-        return observations.keep((silhouettes <= MOST_SILHOUETTE * counts)[observations.owners])
+        counts = self._counts(observations)
+        silhouettes = self._counts(observations, observations.silhouette)
+        enough = (counts - silhouettes >= LEAST_INSIDE) & (silhouettes <= MOST_SILHOUETTE * counts)
+        return observations.keep(enough[observations.owners])
 
-    def _residuals_in(self, view, edgels):
-        """`residuals` of one view's edgels."""
+    def _without_odd_views(self, observations, known):
+        """The observations without silhouettes of views that disagree with the others on how far outside they lie.
+
+        That is told from points placed by edgels inside alone.
+        """
+        outside = observations.silhouette > 0
+        placed = fit_offsets(observations.keep(~outside), np.append(0.0, known[1:]), len(self.points))
+        moved = (observations.slopes * placed.displacements[observations.owners]).sum(axis=1)
+        offsets = observations.offsets - observations.normals @ placed.values[1:] - moved
+        middles = np.full(len(self.views), np.nan)
+        for view in np.flatnonzero(np.bincount(observations.views[outside]) >= LEAST_IN_VIEW):
+            middles[view] = np.median(offsets[outside & (observations.views == view)])
+        if np.isnan(middles).all():
+            return observations
+        odd = np.abs(middles - np.nanmedian(middles)) > ODD_PX
+        return observations.keep(~(outside & odd[observations.views]))
+
+    def _steady(self, observations, fit):
+        """The observations of points that most of their edgels agree with, on silhouettes as well as inside."""
+        sizes = np.abs(fit.residuals)
+        agree = sizes <= max(AGREEING_PX, AGREEING_SCALES * NORMAL_MAD * np.median(sizes))
+        steady = np.ones(len(self.points), bool)
+        for kind in (observations.silhouette > 0, observations.silhouette == 0):
+            steady &= self._counts(observations, kind & agree) >= STEADY_SHARE * self._counts(observations, kind)
+        return observations.keep(steady[observations.owners])
+
+    def _counts(self, observations, weights=None):
+        """(p,) of each point the number of its observations, or the sum of their weights."""
+        return np.bincount(observations.owners, weights, len(self.points))
+
+    def _residuals_in(self, view, edgels, placed):
+        """`residuals` of one view's edgels. placed: (p,) bool, the points that may explain any."""
         places, normals, _ = edgels.of_view(view)
         residuals = np.full(len(places), np.nan)
         owners, found = self._edgels_beside(view, edgels, REACHES[-1])
+        owners, found = (array[placed[owners]] for array in (owners, found))
         pixels, _ = self.views.project(self.points[owners], view)
         others, rows = _neighbours(edgel_table(places, (self.views.height, self.views.width)), places, normals, found)
         across_edge = normals[found[rows]]

@@ -5,6 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 LEAST_OBSERVATIONS = 200  # fewer tell nothing
+# px, median; where references agree with edgels no better, as on textured photographs or between thin bars, chance has
+# made the pairs. The scale of a robust fit grows with what it is given, so its standard errors do not tell.
+MOST_RESIDUAL = 0.35
 NOTHING_KNOWN = 100.0  # px; prior standard deviation of an offset: one that nothing observes keeps it as its error
 FREE_WAY = 10.0  # px; prior standard deviation of a point's displacement, far beyond what seeds are off
 ABSOLUTE_ROUNDS, REDESCENDING_ROUNDS = 4, 8  # first least absolute values, from anywhere; then outliers drop out

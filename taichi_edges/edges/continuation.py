@@ -58,7 +58,7 @@ def continued(shapes, yardstick, pixel, seen, gap_px=JOINT_GAP_PX):
     rounded, circles = with_whole_circles(shapes, yardstick, pixel, seen)
     chained = rejoined(rounded, yardstick, pixel, seen, gap_px)
     single = without_repeats(chained, yardstick, pixel)
-    joined = len(shapes) - len(rounded) + len(rounded) - len(chained)
+    joined = len(shapes) - len(chained)
     return single, Merging(circles, joined, len(chained) - len(single))
 
 

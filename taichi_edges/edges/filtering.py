@@ -17,7 +17,6 @@ LEAST_VIEWS = 3.0  # of full strength; two planes always meet, and a third one i
 # An edge that fewer views see must be seen from different directions, 15 degrees apart from their mean: neighbouring
 # views see an occluding contour in one place as well.
 FEW_VIEWS, FEW_SPREAD = 6.0, np.sin(np.radians(15.0)) ** 2
-LENIENT = 0.75  # of the least steadiness, for a point
 RARE = 0.8  # of a harvested point's support, which those that continue it need
 HARVEST_KEEP = 0.06  # share of the views that must see one of the edges left over
 
@@ -40,17 +39,18 @@ def filter_points(means, directions, opacities, views, config, edge_threshold, g
 
     means: (n, 3) unit cube. directions: (n, 3) unit vectors. opacities: (n,). config: the scene's `filter` section.
     generator: numpy.random.Generator, for what is left to chance in the harvest. ti.init must have been called.
-    Returns points (m, 3) float64, directions (m, 3) float64, steadiness (m,), and FilterCounts.
+    Returns points (m, 3) float64, directions (m, 3) float64, what edgels say about them (Explained; None where they are
+    not refined), and FilterCounts.
     """
     opaque = np.asarray(opacities) >= config.min_opacity
     points, directions = (np.asarray(array, dtype=np.float64)[opaque] for array in (means, directions))
     if config.refine:
         found = refined_points(points, directions, views, config, edge_threshold, generator)
-        points, directions, steadiness, counts = found
+        points, directions, explained, counts = found
     else:
         on_edges = _on_edge_pixels(points, views, config.min_support, edge_threshold)
         points, directions, counts = points[on_edges], directions[on_edges], {"low_support": int((~on_edges).sum())}
-        steadiness = np.ones(len(points))
+        explained = None
     inliers = statistical_inliers(points, config.outlier_neighbors, config.outlier_deviations)
     counts = FilterCounts(
         gaussians=len(opaque),
@@ -58,7 +58,8 @@ def filter_points(means, directions, opacities, views, config, edge_threshold, g
         **counts,
         outliers=len(points) - len(inliers),
     )
-    return points[inliers], directions[inliers], steadiness[inliers], counts
+    explained = explained and explained.keep(inliers)
+    return points[inliers], directions[inliers], explained, counts
 
 
 def _on_edge_pixels(points, views, least, edge_threshold):
@@ -74,7 +75,7 @@ def _on_edge_pixels(points, views, least, edge_threshold):
 def refined_points(points, directions, views, config, edge_threshold, generator):
     """Points on the edges that the edgels of the views agree on. Arguments as for `filter_points`.
 
-    Returns points, directions, steadiness and the counts of FilterCounts that this is about.
+    Returns points, directions, Explained and the counts of FilterCounts that this is about.
     """
     from taichi_edges.edges.growing import grow_points
     from taichi_edges.kernels.edgel_matching import EdgelMatching
@@ -91,12 +92,13 @@ def refined_points(points, directions, views, config, edge_threshold, generator)
         least = np.full(len(refined), config.grow)
         least[sizes[2] :] = np.minimum(config.grow, RARE * refined.support[sizes[2] :])  # what was harvested is rare
         refined = grow_points(matching, refined, least)
-    supported, steady, steadiness = judge(matching, refined, config)
+    supported, steady, explained = judge(matching, refined, config)
     sizes += [len(refined), supported.sum(), steady.sum()]
     weak, unsteady, harvested, grown, weak_later, unsteady_later = np.abs(np.diff(sizes)).tolist()
     counts = {"low_support": weak + weak_later, "unsteady": unsteady + unsteady_later}
     refined = refined.keep(steady)
-    return refined.points, refined.directions, steadiness[steady], {**counts, "harvested": harvested, "grown": grown}
+    counts = {**counts, "harvested": harvested, "grown": grown}
+    return refined.points, refined.directions, explained.keep(steady), counts
 
 
 def judge(matching, refined, config):
@@ -104,7 +106,7 @@ def judge(matching, refined, config):
 
     An occluding contour does not: its support comes from views that happen to look from similar directions. Steadiness
     is a matter of an edge and not of a point, so the median of a neighbourhood decides, and leniently: there will be
-    surer evidence when the edges are known (`drop_contours`). Returns also the (n,) steadiness.
+    surer evidence when the edges are known (`contours.steady_edges`). Returns also the Explained of the points.
     """
     from taichi_edges.explaining import explain
 
@@ -115,19 +117,8 @@ def judge(matching, refined, config):
     if len(places):
         around = cKDTree(places).query(places, min(AROUND, len(places)))[1].reshape(len(places), -1)
         typical = np.median(explained.steadiness[supported][around], axis=1)
-        steady[supported] = typical >= LENIENT * config.min_steadiness
-    return supported, steady, explained.steadiness
-
-
-def drop_contours(labels, steadiness, least):
-    """(n,) labels without the clusters whose mean steadiness is below `least`, and the number of these."""
-    if labels.max(initial=-1) < 0:
-        return labels, 0
-    clustered = labels >= 0
-    sums = np.bincount(labels[clustered], steadiness[clustered])
-    kept = sums >= least * np.bincount(labels[clustered])
-    numbers = np.where(kept, np.cumsum(kept) - 1, -1)
-    return np.where(clustered, numbers[labels], -1), int((~kept).sum())
+        steady[supported] = typical >= config.min_steadiness
+    return supported, steady, explained
 
 
 def harvest(matching, refined, views, config, edge_threshold, generator):

@@ -113,7 +113,8 @@ def bent_shape(track, tolerance):
 
 def fitted_spline(track, tolerance, cubics):
     """The chain of some cubics through a Track."""
-    return Spline(fit_chain(track.points, track.ordering, tolerance, cubics)[0], track.closed)
+    whole = track if track.closed else _with_ends(track)
+    return Spline(fit_chain(whole.points, whole.ordering, tolerance, cubics)[0], track.closed)
 
 
 def fitted_line(track, tolerance):
@@ -171,6 +172,18 @@ def _round_ellipse(ellipse, track):
     )
 
 
+def _with_ends(track):
+    """The Track with one more place at each end, where the stretch that the outermost place stands for ends."""
+    (first, second), (before, last) = track.points[:2], track.points[-2:]
+    steps = 0.5 * track.share[[0, -1]]
+    ends = first - steps[0] * _unit(second - first), last + steps[1] * _unit(last - before)
+    return Track(
+        np.concatenate([ends[:1], track.points, ends[1:]]),
+        np.concatenate([[track.arc[0] - steps[0]], track.arc, [track.arc[-1] + steps[1]]]),
+        np.concatenate([[0.0], track.share, [0.0]]),
+    )
+
+
 def _settled(arc, track, tolerance, straight):
     """The Arc fitted to a Track, first with a wide tolerance."""
     unused = np.broadcast_to(arc.tangent, track.points.shape)
@@ -204,7 +217,11 @@ def distances_to(shape, points):
 
 
 def _distances_to_ellipse(shape, points):
-    """(n,) distances of points to an EllipticArc: exact for a circle, by Newton's steps on the angle for an ellipse."""
+    """(n,) distances of points to an EllipticArc: exact for a circle, by Newton's steps on the angle for an ellipse.
+
+    Of a point farther from an elliptic arc than its least radius of curvature, too great if the nearest place of the
+    whole ellipse is not on the arc.
+    """
     offsets = points - shape.centre
     x, y = (offsets @ axis / radius for axis, radius in zip(shape.axes, shape.radii, strict=True))
     t = np.arctan2(y / shape.radii[1], x / shape.radii[0]) if shape.circular else np.arctan2(y, x)

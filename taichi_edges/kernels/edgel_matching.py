@@ -16,7 +16,8 @@ from taichi_edges.views import pixel_size
 
 CELL = 8  # px; side of the cells in which edgels are looked up, at least the largest radius
 MOST_SINE = 0.35  # of the angle between an edgel and a projected direction: 20 degrees, as a bend or noise may turn it
-OWNED_PX, OWNED_MOST = 2.0, 6  # neighbours of an edgel: those so near, itself included, at most so many
+OWNED_PX, OWNED_MOST = 2.0, 6  # neighbours of an edgel: those so near, itself included, at most so many,
+OWNED_BESIDE_PX = 0.5  # and no farther to the side: an edge may run beside another
 APART = 100.0  # px; views are laid out so far apart when one tree holds the edgels of all of them
 EQUATIONS = 11  # numbers of a point's normal equations, see `add_equations`
 
@@ -55,10 +56,13 @@ class EdgelMatching:
 
     @cached_property
     def neighbors(self):
-        """(n, OWNED_MOST) indices of the edgels within OWNED_PX of each in its view, itself included and repeated."""
-        places = np.column_stack([self.edgels.points, APART * self.edgels.views])
+        """(n, OWNED_MOST) indices of the edgels before and after each on its 2D edge, itself included and repeated."""
+        points, own = self.edgels.points, np.arange(len(self.edgels))[:, None]
+        places = np.column_stack([points, APART * self.edgels.views])
         distances, near = cKDTree(places).query(places, OWNED_MOST, distance_upper_bound=OWNED_PX)
-        return np.where(np.isfinite(distances), near, np.arange(len(places))[:, None])
+        near = np.where(np.isfinite(distances), near, own)
+        beside = np.abs(np.einsum("nkc,nc->nk", points[near] - points[:, None], self.edgels.normals))
+        return np.where(beside <= OWNED_BESIDE_PX, near, own)
 
     def equations(self, points, directions, radius, scale):
         """(n, EQUATIONS) float32 normal equations of where the points are, see `add_equations`.

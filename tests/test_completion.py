@@ -1,0 +1,134 @@
+"""Short lines that nobody has found, between vertices that are known: where the images show them, and only there."""
+
+import numpy as np
+import pytest
+from edgel_scenes import views_of
+
+from taichi_edges.edges.completion import LONGEST_PX, MOST_PAIRS, clear_places, completed, open_pairs
+from taichi_edges.kernels.edgel_matching import EdgelMatching
+from taichi_edges.shapes import Line
+from taichi_edges.wireframe import Edge, Wireframe
+
+NEAR, FAR = np.array([[0.4, 0.4, 0.35], [0.48, 0.42, 0.35]]), np.array([[0.35, 0.7, 0.5], [0.55, 0.75, 0.45]])
+SEEDS = range(2)
+VIEWS = 16
+
+
+@pytest.fixture
+def taichi(start_taichi):
+    start_taichi("f32", 2)
+
+
+def turned(points, generator):
+    """The points turned about the upright axis through the middle of the cube: round the ring of cameras."""
+    angle = generator.uniform(0, 2 * np.pi)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    return (points - 0.5) @ turn.T + 0.5
+
+
+def bridge(generator):
+    """The Wireframe of two vees whose tips are near each other, and (2, 3) the tips.
+
+    From each of the two tips, vertices 0 and 1, lines go to two vertices that are far away.
+    """
+    vertices = turned(np.concatenate([NEAR, FAR, FAR + [0.1, -0.5, 0.3]]), generator)
+    pairs = [(0, 2), (0, 4), (1, 3), (1, 5)]
+    edges = tuple(Edge(Line(vertices[list(pair)]), pair) for pair in pairs)
+    return Wireframe(vertices, edges, np.zeros((0, 2), np.int64)), vertices[:2]
+
+
+def curve_of(shape):
+    """A shape as a curve of edgel_scenes."""
+    return lambda s: shape.at(np.asarray(s))
+
+
+def matching_of(shapes, generator, **settings):
+    curves = [curve_of(shape) for shape in shapes]
+    return EdgelMatching(views_of(curves, generator, noise_px=0.1, count=VIEWS, **settings))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_missing_line_is_found(taichi, generator, seed):
+    wireframe, tips = bridge(generator)
+    found, count = completed(wireframe, matching_of([*wireframe.shapes, Line(tips)], generator))
+    assert count == 1 and len(found) == len(wireframe) + 1
+    assert set(found.edges[-1].vertices) == {0, 1}
+    np.testing.assert_array_equal(found.edges[-1].shape.points, found.vertices[list(found.edges[-1].vertices)])
+    np.testing.assert_array_equal(found.vertices, wireframe.vertices)
+
+
+@pytest.mark.parametrize("hidden", [0.2, 0.4])
+def test_missing_line_may_be_hidden_in_some_views(taichi, generator, hidden):
+    wireframe, tips = bridge(generator)
+    assert completed(wireframe, matching_of([*wireframe.shapes, Line(tips)], generator, hidden=hidden))[1] == 1
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_nothing_is_added_where_the_images_show_nothing(taichi, generator, seed):
+    wireframe, _ = bridge(generator)
+    assert completed(wireframe, matching_of(wireframe.shapes, generator))[1] == 0
+
+
+def test_half_a_line_is_none(taichi, generator):
+    wireframe, tips = bridge(generator)
+    half = Line(np.array([tips[0], tips.mean(axis=0)]))
+    assert completed(wireframe, matching_of([*wireframe.shapes, half], generator))[1] == 0
+
+
+def test_line_that_is_known_is_not_added_again(taichi, generator):
+    wireframe, tips = bridge(generator)
+    once, _ = completed(wireframe, matching_of([*wireframe.shapes, Line(tips)], generator))
+    assert completed(once, matching_of(once.shapes, generator))[1] == 0
+
+
+def test_edge_in_the_way_owns_its_edgels(taichi, generator):
+    """A line through both tips that ends in neither."""
+    wireframe, tips = bridge(generator)
+    along = Line(Line(tips).at(np.array([-0.5, 1.5])))
+    matching = matching_of([*wireframe.shapes, along], generator)
+    vertices = np.concatenate([wireframe.vertices, along.ends])
+    edges = (*wireframe.edges, Edge(along, (6, 7)))
+    assert completed(Wireframe(vertices, edges, wireframe.contacts), matching)[1] == 0
+
+
+def test_free_ends_are_not_completed(taichi, generator):
+    """Only vertices in which edges meet are known well enough."""
+    wireframe, tips = bridge(generator)
+    matching = matching_of([*wireframe.shapes, Line(tips)], generator)
+    assert completed(wireframe.keep(np.array([True, True, True, False])), matching)[1] == 0
+
+
+# -------------------------------------------------------------------------------------------------------------- pairs
+
+
+def test_pairs_are_near_and_open_and_of_vertices_where_edges_meet(generator):
+    """Against all pairs, one by one."""
+    vertices, pixel = generator.random((40, 3)), 0.004
+    joined = {tuple(sorted(pair)) for pair in generator.integers(0, 40, (50, 2)).tolist() if pair[0] != pair[1]}
+    edges = tuple(Edge(Line(vertices[list(pair)]), pair) for pair in sorted(joined))
+    wireframe = Wireframe(vertices, edges, np.array([[0, 1], [5, 2]]))
+    found, degrees = open_pairs(wireframe, pixel), wireframe.degrees
+    expected = {
+        (i, j)
+        for j in range(40)
+        for i in range(j)
+        if 4 * pixel <= np.linalg.norm(vertices[i] - vertices[j]) <= LONGEST_PX * pixel
+        and min(degrees[i], degrees[j]) >= 2
+        and (i, j) not in joined
+    }
+    assert {tuple(sorted(pair)) for pair in found.tolist()} == expected and len(found) == len(expected) > 0
+    lengths = np.linalg.norm(vertices[found[:, 0]] - vertices[found[:, 1]], axis=1)
+    assert (np.diff(lengths) >= 0).all() and len(found) <= MOST_PAIRS
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_no_pairs_of_hardly_any_vertices(count):
+    assert len(open_pairs(Wireframe.loose([Line(np.eye(3)[:2])] * count), 0.001)) == 0
+
+
+@pytest.mark.parametrize("pixels", [4.0, 7.3, 60.0])
+def test_places_between_are_a_pixel_apart_and_clear_of_the_ends(pixels):
+    line = Line(np.array([[0.0, 0, 0], [pixels * 0.002, 0, 0]]))
+    places = line.at(clear_places(line, 0.002))[:, 0] / 0.002
+    assert places[0] == pytest.approx(pixels - places[-1]) and places[0] >= min(2.0, 0.3 * pixels) - 1e-9
+    assert np.diff(places).max() <= 1.5 and len(places) >= 3

@@ -1,0 +1,121 @@
+"""Edges told from occluding contours by where their edgels lie as the viewpoint moves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from edgel_scenes import CylinderContour, arc, centre, line, pixel_of, tangents, views_of
+
+from taichi_edges.edges.assembly import ARC_NUMBERS, Assembly
+from taichi_edges.edges.contours import CONTOUR_SHARE, evidence, steady_edges, without_contours
+from taichi_edges.explaining import explain
+from taichi_edges.kernels.edgel_matching import EdgelMatching
+from taichi_edges.scene import FilterConfig
+from taichi_edges.viewing_planes import refine_points
+
+A = line([0.2, 0.3, 0.3], [0.8, 0.35, 0.4])
+RIM = arc([0.5, 0.5, 0.6], 0.25)
+LEAST = FilterConfig().min_evidence
+NOISE_PX = 0.05  # of our own detector
+PIXEL = 0.0046  # of these views, unit-cube units
+
+
+@pytest.fixture(autouse=True)
+def taichi(start_taichi):
+    start_taichi("f32", 2)
+
+
+def judged(views, curves, radii=(1.0,), moved=True):
+    """(m,) bool: which of the clusters of points along some curves, `moved` to their edgels or not, pass for edges."""
+    s = np.linspace(0.1, 0.9, 40)
+    places, along = (np.concatenate([of(curve, s) for curve in curves]) for of in (lambda c, s: c(s), tangents))
+    matching = EdgelMatching(views)
+    found = refine_points(matching, places, along, radii)
+    found = found if moved else replace(found, points=places, directions=along)
+    labels = np.repeat(np.arange(len(curves)), len(s))
+    return steady_edges(matching, found.points, found.directions, labels, explain(matching, found), LEAST)
+
+
+def lines_on(contour, views, every):
+    """The lines in which every so many views see a cylinder's contour: what a reconstruction takes for edges."""
+    return [contour.seen_from(centre(views, view)) for view in range(0, len(views), every)]
+
+
+@pytest.mark.parametrize("radius_px", [6, 12, 26])
+def test_contours_are_no_edges_and_do_not_explain_each_other(generator, radius_px):
+    contour = CylinderContour([0.6, 0.5], radius_px * PIXEL, 0.2, 0.8)
+    views = views_of([A, RIM, contour], generator, noise_px=NOISE_PX)
+    assert pixel_of(views) == pytest.approx(PIXEL, rel=0.01)
+    edges = judged(views, [A, RIM, *lines_on(contour, views, every=3)], radii=(3.0, 2.0, 1.0))
+    assert edges[:2].all()
+    assert edges[2:].mean() <= 0.25  # three views always meet in a line, and may be the only ones nearby
+
+
+class Rounding(CylinderContour):
+    """The contour of an edge's rounding, seen from where neither of its two faces turns away; else a line elsewhere."""
+
+    def seen_from(self, camera):
+        bearing = np.arctan2(*(camera[:2] - self.middle)[::-1])
+        elsewhere = line([0.1, 0.1, 0.1], [0.1, 0.1, 0.3])
+        return super().seen_from(camera) if np.abs(bearing) < np.radians(60) else elsewhere
+
+
+def test_an_edge_rounded_by_less_than_a_pixel_is_an_edge(generator):
+    """Its contour moves by 0.9 px (1 - cos 60 degrees), less than half a pixel, half of it to either side."""
+    rounded = Rounding([0.6, 0.5], 0.9 * PIXEL, 0.2, 0.8)
+    views = views_of([A, RIM, rounded], generator, noise_px=NOISE_PX, count=48)
+    middle = line([0.6, 0.5 + 0.9 * PIXEL, 0.2], [0.6, 0.5 + 0.9 * PIXEL, 0.8])
+    assert judged(views, [A, RIM, middle], radii=(2.0, 1.0, 1.0)).all()
+
+
+def test_close_parallel_edges_stay(generator):
+    """2 pixels apart, each hidden in a third of the views, in which the edgels of the other are all there is."""
+    pair = [line([0.2, y, 0.5], [0.8, y, 0.5]) for y in (0.5, 0.5 + 2 * PIXEL)]
+    views = views_of([*pair, RIM], generator, noise_px=NOISE_PX, hidden=0.33)
+    assert judged(views, [*pair, RIM]).all()
+
+
+def test_a_line_whose_edgels_others_explain_is_none(generator):
+    """A second line 2/3 of a pixel beside an edge lies on the edgels of that one only."""
+    views = views_of([A, RIM], generator, noise_px=NOISE_PX)
+    beside = line(np.array([0.2, 0.3, 0.303]), np.array([0.8, 0.35, 0.403]))
+    np.testing.assert_array_equal(judged(views, [A, beside, RIM], moved=False), [True, False, True])
+
+
+def test_evidence_grows_with_the_share_and_with_the_views():
+    usual = CONTOUR_SHARE
+    assert evidence(0.0, 0.0, usual) == 0.0 and evidence(usual * 20, 20, usual) == pytest.approx(0.0, abs=1e-9)
+    assert evidence(3, 20, usual) == 0.0  # fewer than a contour has
+    assert evidence(8, 10, usual) > evidence(7, 10, usual)
+    assert evidence(16, 20, usual) == pytest.approx(2 * evidence(8, 10, usual))
+    assert evidence(2, 2, usual) == pytest.approx(-2 * np.log(usual), rel=1e-3)
+
+
+def test_the_assembly_is_left_without_contours(generator):
+    contour = CylinderContour([0.6, 0.5], 12 * PIXEL, 0.2, 0.8)
+    views = views_of([A, contour], generator, noise_px=NOISE_PX)
+    limb, s = lines_on(contour, views, every=24)[0], np.linspace(0.1, 0.9, 40)
+    matching = EdgelMatching(views)
+    found = refine_points(
+        matching, np.concatenate([limb(s), A(s)]), np.concatenate([tangents(limb, s), tangents(A, s)]), (3.0, 1.0)
+    )
+    assembly = Assembly(
+        np.repeat([0, 1], 40), np.array([[0, 1], [79, 0]]), np.arange(2.0)[:, None] * np.ones(ARC_NUMBERS)
+    )
+    explained = explain(matching, found)
+    kept, contours = without_contours(assembly, found.points, found.directions, explained, views, LEAST)
+    assert contours == 1 and kept.arcs[:, 0].tolist() == [1.0]
+    np.testing.assert_array_equal(kept.labels, np.repeat([-1, 0], 40))
+    np.testing.assert_array_equal(kept.shared, [[0, 0]])
+    untouched, contours = without_contours(assembly, found.points, found.directions, None, views, LEAST)
+    assert untouched is assembly and contours == 0
+
+
+def test_the_result_does_not_depend_on_threads(start_taichi, generator):
+    contour = CylinderContour([0.6, 0.5], 6 * PIXEL, 0.2, 0.8)
+    views = views_of([A, RIM, contour], generator, noise_px=0.2, hidden=0.4)
+    found = []
+    for threads in (1, 2):
+        start_taichi("f32", threads)
+        found.append(judged(views, [A, RIM, *lines_on(contour, views, every=2)], radii=(3.0, 1.0)))
+    np.testing.assert_array_equal(*found)
