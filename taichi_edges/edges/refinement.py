@@ -15,7 +15,7 @@ from taichi_edges.edges.model_selection import Yardstick
 from taichi_edges.edges.regularities import found_relations, regularised
 from taichi_edges.kernels.edgel_matching import EdgelMatching
 
-NOISE_PX = 0.2  # by which a place on an edge may be off its shape, at least: next to other edges every detector is
+NOISE_PX = 0.2  # by which an edge is off its shape, beyond the noise: next to other edges every detector is biased
 STRETCH_PX = 4.0  # length of an edge on which the errors go together
 WIDE_GAP_PX = 24.0  # between strokes that continue each other, where their ends are still free after the first pass
 MOST_COMPARED = (
@@ -65,7 +65,8 @@ def whole_edges(shapes, matching):
     Free ends are extended only when it is known which are free, and then some more strokes continue each other.
     """
     pixel, seen = matching.pixel, partial(support_along, matching)
-    yardstick = Yardstick(NOISE_PX * pixel, STRETCH_PX * pixel)
+    noise = np.hypot(NOISE_PX, support_of(matching, shapes).noise_px)
+    yardstick = Yardstick(noise * pixel, STRETCH_PX * pixel)
     shapes, first = continued(shapes, yardstick, pixel, seen)
     kept = with_support(matching, shapes)
     longer, second = continued(with_longer_ends(matching, kept), yardstick, pixel, seen, WIDE_GAP_PX)
