@@ -20,6 +20,7 @@ from taichi_edges.edges.model_selection import (
     price_of,
     track_of,
 )
+from taichi_edges.shapes import bounds_of, near_bounds
 
 BESIDE = 3.0  # noises: places so near to a shape are on it
 PARALLEL = np.cos(np.radians(20.0))
@@ -68,7 +69,7 @@ def continued(shapes, yardstick, pixel, seen, gap_px=JOINT_GAP_PX):
 def with_whole_circles(shapes, yardstick, pixel, seen):
     """The shapes, arcs replaced by the circle they are parts of where that goes on; and how many circles that gave."""
     shapes, circles = list(shapes), []
-    tracks = [track_of(shape, pixel) for shape in shapes]
+    tracks, bounds = [track_of(shape, pixel) for shape in shapes], bounds_of(shapes)
     waiting = sorted((n for n, shape in enumerate(shapes) if shape.kind == "arc"), key=lambda n: -shapes[n].length)
     gone = set()
     for number in waiting:
@@ -78,6 +79,8 @@ def with_whole_circles(shapes, yardstick, pixel, seen):
         circle = circle_around(shapes[number], [tracks[n] for n in others], yardstick)
         if circle is None:
             continue
+        near = near_bounds(bounds, bounds_of([circle])[0], BESIDE * yardstick.noise)
+        others = sorted(set(others) & set(near.tolist()))
         on = {n: on_shape(circle, tracks[n], yardstick) for n in others}
         parts = [n for n in others if on[n].mean() >= REPEATED]
         places = np.concatenate([tracks[n].points[on[n]] for n in others])
@@ -263,11 +266,13 @@ def joined_track(tracks):
 
 def without_repeats(shapes, yardstick, pixel):
     """The shapes without those that lie beside longer ones on their whole length."""
-    kept = []
+    kept, bounds = set(), bounds_of(shapes)
     for number in sorted(range(len(shapes)), key=lambda number: -shapes[number].length):
         track = track_of(shapes[number], pixel)
-        if not kept or beside_others(track, [shapes[other] for other in kept], yardstick).mean() < REPEATED:
-            kept.append(number)
+        near = kept & set(near_bounds(bounds, track.points, BESIDE * yardstick.noise).tolist())
+        others = [shapes[other] for other in sorted(near)]
+        if not others or beside_others(track, others, yardstick).mean() < REPEATED:
+            kept.add(number)
     return [shapes[number] for number in sorted(kept)]
 
 
