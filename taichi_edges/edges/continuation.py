@@ -19,6 +19,7 @@ from taichi_edges.edges.model_selection import (
     observations,
     price_of,
     track_of,
+    unit,
 )
 from taichi_edges.shapes import bounds_of, near_bounds
 
@@ -33,10 +34,8 @@ FOLLOWED = 0.5  # of the places of a stroke that the shape which replaces it run
 CHORDS = 512  # of a shape, for its tangents
 COVERED = 0.5  # of a circle by strokes, at least
 GAP_SHOWN = 0.7  # of what lies between them, which the images must show as well
-GAP_SEEN, LEAST_GAP_VIEWS = (
-    0.25,
-    1.0,
-)  # a place is shown in this share of the views that see the strokes; in one at least
+GAP_SEEN = 0.25  # a place is shown by this share of the views that see the strokes
+LEAST_GAP_VIEWS = 1.0  # and by one at least
 REPEATED = 0.9  # of the places of a stroke beside others, from which on it says nothing new
 
 
@@ -188,7 +187,7 @@ def joints(shapes, yardstick, pixel, gap_px):
         if ends[i][0] == ends[j][0] or outward[i] @ outward[j] > -JOINT_COSINE:
             continue
         step = places[j] - places[i]
-        along = _unit(outward[i] - outward[j])
+        along = unit(outward[i] - outward[j])
         aside = np.linalg.norm(step - (step @ along) * along)
         if aside <= BESIDE * yardstick.noise + JOINT_ASIDE * abs(step @ along):
             turn = np.arccos(np.clip(-outward[i] @ outward[j], -1, 1))
@@ -249,7 +248,7 @@ def joined_track(tracks):
     arcs, offset, before = [], 0.0, None
     for track in tracks:
         if before is not None:
-            heading = _unit(before.points[-1] - before.points[-2])
+            heading = unit(before.points[-1] - before.points[-2])
             offset = (
                 arcs[-1][-1] + max((track.points[0] - before.points[-1]) @ heading, -before.share[-1]) - track.arc[0]
             )
@@ -279,8 +278,3 @@ def without_repeats(shapes, yardstick, pixel):
 def beside_others(track, shapes, yardstick):
     """(n,) bool: the places of a Track that lie on one of the shapes and run along it."""
     return np.any([on_shape(shape, track, yardstick) for shape in shapes], axis=0)
-
-
-def _unit(vector):
-    """A vector of length 1."""
-    return vector / max(np.sqrt(vector @ vector), 1e-300)
