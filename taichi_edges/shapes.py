@@ -213,3 +213,22 @@ def polyline(shape, chords=32):
         pieces = evaluate_bezier(shape.curves, np.linspace(0, 1, chords + 1))
         return np.concatenate([pieces[0, :1], *pieces[:, 1:]])
     return shape.at(np.linspace(0, 1, chords * len(shape.cubics()) + 1))
+
+
+def bounds_of(shapes):
+    """(S, 2, 3) least and greatest coordinates, of boxes that hold the shapes: of whole ellipses, of control points."""
+    corners = np.zeros((len(shapes), 2, 3))
+    for corner, shape in zip(corners, shapes, strict=True):
+        if isinstance(shape, EllipticArc):
+            half = np.linalg.norm(shape.axes, axis=0)
+            corner[:] = shape.centre - half, shape.centre + half
+        else:
+            places = shape.cubics().reshape(-1, 3)
+            corner[:] = places.min(axis=0), places.max(axis=0)
+    return corners
+
+
+def near_bounds(bounds, points, margin):
+    """Indices of the boxes (S, 2, 3) that come nearer than `margin` to the box of (n, 3) points."""
+    apart = np.maximum(bounds[:, 0] - points.max(axis=0), points.min(axis=0) - bounds[:, 1]).max(axis=1)
+    return np.flatnonzero(apart <= margin)

@@ -6,7 +6,7 @@ from placed_shapes import KINDS, PLANE, Placing, any_shape
 
 from taichi_edges.bezier import evaluate_bezier
 from taichi_edges.edges.arcs import Arc, through_three
-from taichi_edges.shapes import EllipticArc, Line, polyline
+from taichi_edges.shapes import EllipticArc, Line, bounds_of, near_bounds, polyline
 
 NAMES = {"long_arc": "arc", "long_elliptic_arc": "elliptic_arc", "loop": "spline"}
 HALF_STEP = 1e-6  # of the parameter, over which slow tangents are differences
@@ -102,6 +102,18 @@ def test_lines_and_arcs_go_on_beyond_their_ends(generator, kind, parameter):
     longer = Line(shape.at(wider)) if kind == "line" else shape.over(*shape.angles(wider))
     np.testing.assert_allclose(shape.at(parameter), longer.at((parameter + 0.2) / 1.4), atol=1e-12)
     np.testing.assert_allclose(shape.tangents(parameter), longer.tangents((parameter + 0.2) / 1.4), atol=1e-12)
+
+
+def test_bounds_hold_the_shapes_and_find_what_is_near_them(generator):
+    shapes = [any_shape(kind, generator) for kind in KINDS for _ in range(5)]
+    bounds, points = bounds_of(shapes), generator.uniform(0.4, 0.6, (4, 3))
+    for (low, high), shape in zip(bounds, shapes, strict=True):
+        places = shape.at(np.linspace(0, 1, 200))
+        assert (places >= low - 1e-12).all() and (places <= high + 1e-12).all()
+    gaps = [np.linalg.norm(shape.at(np.linspace(0, 1, 500))[:, None] - points, axis=2).min() for shape in shapes]
+    for margin in (0.0, 0.02, 0.1):
+        assert set(np.flatnonzero(np.array(gaps) <= margin)) <= set(near_bounds(bounds, points, margin).tolist())
+    assert len(near_bounds(bounds, points + 10.0, 0.1)) == len(near_bounds(bounds_of([]), points, 1.0)) == 0
 
 
 # ----------------------------------------------------------------------------------------------- ellipses and circles

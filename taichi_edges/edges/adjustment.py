@@ -32,10 +32,8 @@ LEAST_NOISE_PX = 0.05  # of the edgels; the best detector's
 TIGHT_RADIUS_PX, SCALE_NOISES = 1.0, 3.0  # so near to the edgels their noise says which of them are the edge's
 START_PX = 1.0  # standard deviation of the edges that are given
 END_PX, MOST_ENDS = 3.0, 0.25  # edgels so near to an end say nothing; at most so much of the length at either end
-PIN_PX, CONTACT_PX = (
-    0.01,
-    0.05,
-)  # standard deviations of a free end along its edge, of a vertex from the edge it touches
+PIN_PX = 0.01  # standard deviation of a free end along its edge
+CONTACT_PX = 0.05  # and of a vertex from the edge it touches
 SMOOTH = np.radians(10.0)  # tangents of curves that differ by less run on into each other
 SMOOTH_DEVIATION = np.radians(1.0)  # of these; where they disagree by several, it is a corner after all
 MOST_STRETCH = 1.6  # an edge that becomes longer or shorter by such a factor has flipped

@@ -9,7 +9,8 @@ from scipy.spatial import cKDTree
 
 from taichi_edges.edges.evidence import claims_of, support_along
 from taichi_edges.edges.growing import LEAST_VIEWS
-from taichi_edges.shapes import Line
+from taichi_edges.edges.model_selection import distances_to
+from taichi_edges.shapes import Line, bounds_of, near_bounds
 from taichi_edges.wireframe import Edge, Wireframe
 
 LONGEST_PX = 60.0  # a longer edge has points of its own
@@ -32,11 +33,19 @@ def completed(wireframe, matching):
         places = clear_places(line, matching.pixel)
         views = support_along(matching, line, places, claims)
         if (views >= LEAST_VIEWS).mean() >= SHOWN and steadiness(matching, line, places, claims) >= STEADY:
-            found.append((float(views.mean()), first, second))
+            if not repeats(line, wireframe.shapes, matching.pixel):
+                found.append((float(views.mean()), first, second))
     edges = list(wireframe.edges)
     for _, first, second in sorted(found, reverse=True):
         edges.append(Edge(Line(wireframe.vertices[[first, second]]), (first, second)))
     return Wireframe(wireframe.vertices, tuple(edges), wireframe.contacts), len(found)
+
+
+def repeats(line, shapes, pixel):
+    """Does a line lie within a pixel of some edge on its whole length? An edge that is not adjusted yet may be off."""
+    places = line.at(np.linspace(0.0, 1.0, 5))
+    near = near_bounds(bounds_of(shapes), places, pixel)
+    return any((distances_to(shapes[number], places) <= pixel).all() for number in near)
 
 
 def steadiness(matching, line, places, claims):

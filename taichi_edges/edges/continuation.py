@@ -19,7 +19,9 @@ from taichi_edges.edges.model_selection import (
     observations,
     price_of,
     track_of,
+    unit,
 )
+from taichi_edges.shapes import bounds_of, near_bounds
 
 BESIDE = 3.0  # noises: places so near to a shape are on it
 PARALLEL = np.cos(np.radians(20.0))
@@ -32,10 +34,8 @@ FOLLOWED = 0.5  # of the places of a stroke that the shape which replaces it run
 CHORDS = 512  # of a shape, for its tangents
 COVERED = 0.5  # of a circle by strokes, at least
 GAP_SHOWN = 0.7  # of what lies between them, which the images must show as well
-GAP_SEEN, LEAST_GAP_VIEWS = (
-    0.25,
-    1.0,
-)  # a place is shown in this share of the views that see the strokes; in one at least
+GAP_SEEN = 0.25  # a place is shown by this share of the views that see the strokes
+LEAST_GAP_VIEWS = 1.0  # and by one at least
 REPEATED = 0.9  # of the places of a stroke beside others, from which on it says nothing new
 
 
@@ -68,7 +68,7 @@ def continued(shapes, yardstick, pixel, seen, gap_px=JOINT_GAP_PX):
 def with_whole_circles(shapes, yardstick, pixel, seen):
     """The shapes, arcs replaced by the circle they are parts of where that goes on; and how many circles that gave."""
     shapes, circles = list(shapes), []
-    tracks = [track_of(shape, pixel) for shape in shapes]
+    tracks, bounds = [track_of(shape, pixel) for shape in shapes], bounds_of(shapes)
     waiting = sorted((n for n, shape in enumerate(shapes) if shape.kind == "arc"), key=lambda n: -shapes[n].length)
     gone = set()
     for number in waiting:
@@ -78,6 +78,8 @@ def with_whole_circles(shapes, yardstick, pixel, seen):
         circle = circle_around(shapes[number], [tracks[n] for n in others], yardstick)
         if circle is None:
             continue
+        near = near_bounds(bounds, bounds_of([circle])[0], BESIDE * yardstick.noise)
+        others = sorted(set(others) & set(near.tolist()))
         on = {n: on_shape(circle, tracks[n], yardstick) for n in others}
         parts = [n for n in others if on[n].mean() >= REPEATED]
         places = np.concatenate([tracks[n].points[on[n]] for n in others])
@@ -185,7 +187,7 @@ def joints(shapes, yardstick, pixel, gap_px):
         if ends[i][0] == ends[j][0] or outward[i] @ outward[j] > -JOINT_COSINE:
             continue
         step = places[j] - places[i]
-        along = _unit(outward[i] - outward[j])
+        along = unit(outward[i] - outward[j])
         aside = np.linalg.norm(step - (step @ along) * along)
         if aside <= BESIDE * yardstick.noise + JOINT_ASIDE * abs(step @ along):
             turn = np.arccos(np.clip(-outward[i] @ outward[j], -1, 1))
@@ -246,7 +248,7 @@ def joined_track(tracks):
     arcs, offset, before = [], 0.0, None
     for track in tracks:
         if before is not None:
-            heading = _unit(before.points[-1] - before.points[-2])
+            heading = unit(before.points[-1] - before.points[-2])
             offset = (
                 arcs[-1][-1] + max((track.points[0] - before.points[-1]) @ heading, -before.share[-1]) - track.arc[0]
             )
@@ -263,19 +265,16 @@ def joined_track(tracks):
 
 def without_repeats(shapes, yardstick, pixel):
     """The shapes without those that lie beside longer ones on their whole length."""
-    kept = []
+    kept, bounds = set(), bounds_of(shapes)
     for number in sorted(range(len(shapes)), key=lambda number: -shapes[number].length):
         track = track_of(shapes[number], pixel)
-        if not kept or beside_others(track, [shapes[other] for other in kept], yardstick).mean() < REPEATED:
-            kept.append(number)
+        near = kept & set(near_bounds(bounds, track.points, BESIDE * yardstick.noise).tolist())
+        others = [shapes[other] for other in sorted(near)]
+        if not others or beside_others(track, others, yardstick).mean() < REPEATED:
+            kept.add(number)
     return [shapes[number] for number in sorted(kept)]
 
 
 def beside_others(track, shapes, yardstick):
     """(n,) bool: the places of a Track that lie on one of the shapes and run along it."""
     return np.any([on_shape(shape, track, yardstick) for shape in shapes], axis=0)
-
-
-def _unit(vector):
-    """A vector of length 1."""
-    return vector / max(np.sqrt(vector @ vector), 1e-300)

@@ -15,7 +15,7 @@ from taichi_edges.edges.arcs import through_three
 from taichi_edges.edges.fitting import fit_chain, lsq_chain, nearest_on_chain
 from taichi_edges.edges.model_selection import distances_to, track_of
 from taichi_edges.edges.ordering import Ordering
-from taichi_edges.shapes import EllipticArc, Line, Spline
+from taichi_edges.shapes import EllipticArc, Line, Spline, bounds_of, near_bounds
 from taichi_edges.wireframe import Edge, Wireframe
 
 REACH_PX = 8.0  # by which an end may move along its edge
@@ -170,13 +170,15 @@ def meeting_point(members):
 
 def with_contacts(shapes, ends, reaches, groups, vertices, pixel):
     """The vertices, those of free ends moved onto an edge that they touch; and (k, 2) the contacts."""
-    vertices, contacts = vertices.copy(), []
+    vertices, contacts, bounds = vertices.copy(), [], bounds_of(shapes)
     for number, group in enumerate(groups):
         own = {ends[end][0] for end in group}
         options = []
-        for other, shape in enumerate(shapes):
+        places = reaches[next(iter(group))].points if len(group) == 1 else vertices[number : number + 1]
+        for other in near_bounds(bounds, places, MEETING_PX * pixel).tolist():
             if other in own:
                 continue
+            shape = shapes[other]
             if len(group) == 1:
                 touch = touching(shape, reaches[next(iter(group))], pixel)
             else:

@@ -119,7 +119,7 @@ def fitted_spline(track, tolerance, cubics):
 
 def fitted_line(track, tolerance):
     """The Arc of no bend through a Track."""
-    start = Arc(track.points.mean(axis=0), _unit(track.points[-1] - track.points[0]), np.zeros(3))
+    start = Arc(track.points.mean(axis=0), unit(track.points[-1] - track.points[0]), np.zeros(3))
     line = _settled(start, track, tolerance, straight=True)
     return _spanning(line, track)
 
@@ -176,7 +176,7 @@ def _with_ends(track):
     """The Track with one more place at each end, where the stretch that the outermost place stands for ends."""
     (first, second), (before, last) = track.points[:2], track.points[-2:]
     steps = 0.5 * track.share[[0, -1]]
-    ends = first - steps[0] * _unit(second - first), last + steps[1] * _unit(last - before)
+    ends = first - steps[0] * unit(second - first), last + steps[1] * unit(last - before)
     return Track(
         np.concatenate([ends[:1], track.points, ends[1:]]),
         np.concatenate([[track.arc[0] - steps[0]], track.arc, [track.arc[-1] + steps[1]]]),
@@ -248,6 +248,6 @@ def track_of(shape, spacing):
     return Track(places, at, np.full(count, arc[-1] / count), shape.closed)
 
 
-def _unit(vector):
+def unit(vector):
     """A vector of length 1."""
     return vector / max(np.sqrt(vector @ vector), 1e-300)

@@ -15,12 +15,10 @@ from taichi_edges.edges.model_selection import Yardstick
 from taichi_edges.edges.regularities import found_relations, regularised
 from taichi_edges.kernels.edgel_matching import EdgelMatching
 
-NOISE_PX = 0.2  # by which a place on an edge may be off its shape, at least: next to other edges every detector is
+NOISE_PX = 0.2  # by which an edge is off its shape, beyond the noise: next to other edges every detector is biased
 STRETCH_PX = 4.0  # length of an edge on which the errors go together
 WIDE_GAP_PX = 24.0  # between strokes that continue each other, where their ends are still free after the first pass
-MOST_COMPARED = (
-    150  # edges whose relations are looked for where nobody asked for them: their number grows as its square
-)
+MOST_COMPARED = 150  # edges whose relations are counted where nobody asked for them: there are as many as its square
 LEAST_STEADY = 0.66  # share of the edgels about an edge that lie on it; contours have half
 LENIENT = 0.75  # of that, for edges that have not been adjusted
 LEAST_SUPPORTED = 0.33  # of the length of an edge; where edges touch, only one of them owns the edgels
@@ -65,7 +63,8 @@ def whole_edges(shapes, matching):
     Free ends are extended only when it is known which are free, and then some more strokes continue each other.
     """
     pixel, seen = matching.pixel, partial(support_along, matching)
-    yardstick = Yardstick(NOISE_PX * pixel, STRETCH_PX * pixel)
+    noise = np.hypot(NOISE_PX, support_of(matching, shapes).noise_px)
+    yardstick = Yardstick(noise * pixel, STRETCH_PX * pixel)
     shapes, first = continued(shapes, yardstick, pixel, seen)
     kept = with_support(matching, shapes)
     longer, second = continued(with_longer_ends(matching, kept), yardstick, pixel, seen, WIDE_GAP_PX)

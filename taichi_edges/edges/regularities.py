@@ -35,10 +35,8 @@ KINDS = ("parallel", "perpendicular", "equal_radius", "coaxial", "coplanar")
 MOST_TURN = np.radians(2.0)  # what is farther from parallel or perpendicular is no candidate; by chance 1 pair in 30 is
 MOST_OFF_PX, MOST_RATIO = 3.0, 0.05  # distances and radii, likewise
 DEVIATION = 1e-4  # of what is imposed, radians or unit-cube units, until it is made exact
-IMPLIED, CLOSE = (
-    1e-6,
-    2e-3,
-)  # standard deviation of what other relations imply; how far it may be off as these are linear
+IMPLIED = 1e-6  # standard deviation of what other relations imply
+CLOSE = 2e-3  # how far it may be off as these are linear
 RADIUS_PX = 1.0  # of the edgels from which covariances come
 CHECKS = 4  # adjustments after which relations that the images contradict have been given up
 DIRECTION, PLACE, RADIUS = slice(0, 3), slice(3, 6), 6
