@@ -29,8 +29,7 @@ from taichi_edges.edges.completion import completed
 from taichi_edges.edges.continuation import continued
 from taichi_edges.edges.evidence import support_along
 from taichi_edges.edges.junctions import connected
-from taichi_edges.edges.model_selection import Yardstick
-from taichi_edges.edges.refinement import NOISE_PX, STRETCH_PX, refine_wireframe, whole_edges
+from taichi_edges.edges.refinement import refine_wireframe, whole_edges, yardstick_of
 from taichi_edges.kernels.edgel_matching import EdgelMatching
 from taichi_edges.pipeline import Run, run_stages
 from taichi_edges.scene_file import load_scene
@@ -122,8 +121,7 @@ def as_fitted(loose, views, config):
 def merged(loose, views, config):
     """Strokes that continue each other are one edge."""
     matching = EdgelMatching(views)
-    yardstick = Yardstick(NOISE_PX * matching.pixel, STRETCH_PX * matching.pixel)
-    seen = partial(support_along, matching)
+    yardstick, seen = yardstick_of(loose.shapes, matching), partial(support_along, matching)
     return Wireframe.loose(continued(loose.shapes, yardstick, matching.pixel, seen)[0])
 
 
