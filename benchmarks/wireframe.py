@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +29,7 @@ from taichi_edges.edges.completion import completed
 from taichi_edges.edges.continuation import continued
 from taichi_edges.edges.evidence import support_along
 from taichi_edges.edges.junctions import connected
-from taichi_edges.edges.model_selection import Yardstick
-from taichi_edges.edges.refinement import NOISE_PX, STRETCH_PX, refine_wireframe, whole_edges
-from taichi_edges.kernels.device import is_running
+from taichi_edges.edges.refinement import refine_wireframe, whole_edges, yardstick_of
 from taichi_edges.kernels.edgel_matching import EdgelMatching
 from taichi_edges.pipeline import Run, run_stages
 from taichi_edges.scene_file import load_scene
@@ -122,8 +121,7 @@ def as_fitted(loose, views, config):
 def merged(loose, views, config):
     """Strokes that continue each other are one edge."""
     matching = EdgelMatching(views)
-    yardstick = Yardstick(NOISE_PX * matching.pixel, STRETCH_PX * matching.pixel)
-    seen = partial(support_along, matching)
+    yardstick, seen = yardstick_of(loose.shapes, matching), partial(support_along, matching)
     return Wireframe.loose(continued(loose.shapes, yardstick, matching.pixel, seen)[0])
 
 
@@ -207,10 +205,14 @@ def evaluated(run, wireframe, views):
 
 
 def trained(run):
-    """The Run, prepared and trained unless it is already; the kernels of what follows are loaded."""
-    record = run_stages(run, until="train")
-    if record["ran"] or not is_running(run.arch, run.threads):
-        run_stages(run, start="cluster", until="refine")
+    """The Run, prepared and trained unless it is already."""
+    run_stages(run, until="train")
+    return run
+
+
+def with_kernels(run):
+    """The trained Run; what follows has been done once, so that nobody's seconds are those of loading kernels."""
+    run_stages(run, start="cluster", until="refine")
     return run
 
 
@@ -267,7 +269,7 @@ def print_ablation(name, options):
     if reason:
         print(f"\nSkipped {path.stem}: {reason}", flush=True)
         return
-    found = ablation(trained(make_run(load_scene(path, "fast"), options)))
+    found = ablation(with_kernels(trained(make_run(load_scene(path, "fast"), options))))
     print(f"\n{path.stem}\n")
     print(table(["step", *STEP_COLUMNS], [[step, *cells(row, STEP_COLUMNS)] for step, row in found.items()]))
     sys.stdout.flush()
@@ -275,12 +277,12 @@ def print_ablation(name, options):
 
 def print_parts(options):
     """Measure the hard parts and print their table."""
-    rows = []
-    for part in options.parts:
-        for source, detector in DETECTORS.items():
-            settings = [f"name={part}_{source}", f"source.part={part}", f"source.detector={detector}"]
-            run = trained(make_run(load_scene(ROOT / "scenes/demo.yaml", "fast", settings), options))
-            rows.append([part, source, *cells(measure_part(run), PART_COLUMNS)])
+    runs = {}
+    for part, source in product(options.parts, DETECTORS):
+        settings = [f"name={part}_{source}", f"source.part={part}", f"source.detector={DETECTORS[source]}"]
+        runs[part, source] = trained(make_run(load_scene(ROOT / "scenes/demo.yaml", "fast", settings), options))
+    with_kernels(next(iter(runs.values())))
+    rows = [[*names, *cells(measure_part(run), PART_COLUMNS)] for names, run in runs.items()]
     print(f"\nThe hard parts\n\n{table(['part', 'from', *PART_COLUMNS], rows)}")
 
 

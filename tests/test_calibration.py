@@ -21,7 +21,7 @@ from taichi_edges.detectors.offsets import (
     standard_errors,
 )
 from taichi_edges.detectors.offsets import _solve as solve
-from taichi_edges.detectors.ridges import trace_ridges
+from taichi_edges.detectors.ridges import single_width, trace_ridges
 from taichi_edges.synthetic.drawing import Imperfections, draw_edge_map
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import (
@@ -470,3 +470,18 @@ def test_ridges_of_wide_bands_have_no_bias_until_the_bands_blend(gap):
     edgels = trace_ridges(edge_map[None], width, 0.3)
     rows = edgels.points[:, 1]
     assert np.abs(np.abs(rows - 40.3 - gap * width / 2) - gap * width / 2).max() < 0.05
+
+
+@pytest.mark.parametrize("gap", [3.2, 12.0])
+def test_width_of_single_lines_is_measured_where_lines_blend(gap):
+    width, rows = 2.5, np.arange(100.0)[:, None]
+    places = np.concatenate([place + gap * np.arange(2) for place in (20.3, 44.6, 68.9)])
+    bands = np.exp(-0.5 * ((rows - places) / (width / 2.355)) ** 2).max(axis=1, keepdims=True)
+    edge_map = np.rint(255 * np.tile(bands, (1, 60))).astype(np.uint8)
+    # Smoothed as for lines of 3.5 px, ridges 3.2 px apart are drawn together, away from their free flanks.
+    assert single_width(edge_map[None], 3.5, 0.3) == pytest.approx(width, abs=0.7)
+    assert single_width(edge_map[None], width, 0.3) == pytest.approx(width, abs=0.35)
+    edgels = trace_ridges(edge_map[None], 3.5, 0.3)
+    nearest = np.abs(edgels.points[:, 1:] - places).min(axis=1)
+    assert len(edgels) == 6 * 60 and nearest.max() < 0.3
+    assert len(trace_ridges(np.zeros((1, 40, 40), np.uint8), 2.5, 0.3)) == 0

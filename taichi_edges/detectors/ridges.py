@@ -13,7 +13,10 @@ import numpy as np
 from taichi_edges.edgels import Edgels
 
 SIGMA_PER_WIDTH = 0.29  # 1 / (2 sqrt 3): the smallest scale at which a bar of that width has one ridge (Steger, eq. 17)
-MIN_SIGMA = 0.8  # px; below, the derivative of the Gaussian is not sampled well
+MIN_SIGMA = 0.65  # px; below, the derivative of the Gaussian is not sampled well
+# Rounds, views, and edgels in each of them, across which the width of single lines is measured.
+WIDTH_ROUNDS, WIDTH_VIEWS, WIDTH_EDGELS = 3, 8, 500
+PROFILE_STEP = 0.25  # px between samples of a profile across a line
 MIN_CURVATURE = 0.1  # of that of a line as narrow as the scale; on a flank rounding alone leaves a faint curvature
 HALF_PIXEL = 0.6  # px; a ridge half-way between two pixels is 0.5 from either or, by the curvature's error, some more
 HALF_DIAGONAL = 0.72  # px; of a pixel, or a rounding more
@@ -107,6 +110,41 @@ def trace_ridges(edge_maps, width_px, threshold, threads=None):
 
     edge_maps: (V, H, W) uint8 with lines about `width_px` wide. threshold: 0..1; ridges with lower values are dropped.
     """
-    sigma = max(MIN_SIGMA, SIGMA_PER_WIDTH * width_px)
+    for _ in range(WIDTH_ROUNDS):  # smoothed less, ridges are drawn less to each other, and flanks seem less far
+        width_px = min(width_px, single_width(edge_maps[:: -(-len(edge_maps) // WIDTH_VIEWS)], width_px, threshold))
+    sigma = _sigma(width_px)
     with ThreadPoolExecutor(threads) as pool:  # OpenCV and NumPy release the lock in the long loops
         return Edgels.of_views(pool.map(lambda edge_map: ridge_points(edge_map, sigma, threshold), edge_maps))
+
+
+def _sigma(width_px):
+    return max(MIN_SIGMA, SIGMA_PER_WIDTH * width_px)
+
+
+def single_width(edge_maps, width_px, threshold):
+    """Typical full width at half maximum, px, of single lines in maps whose lines are about `width_px` wide.
+
+    Lines beside each other, as those of thin bars, blend into bands; smoothed as if one line were that wide, they would
+    become one ridge, or two that are drawn towards each other. But a line keeps its flank on the side where it is free.
+    """
+    halves = []
+    for edge_map in edge_maps:
+        points, normals, values = ridge_points(edge_map, _sigma(width_px), threshold)
+        chosen = np.linspace(0, len(points) - 1, min(len(points), WIDTH_EDGELS)).astype(np.int64)
+        sides = [_half_width(edge_map, points[chosen], sign * normals[chosen], 2 * width_px) for sign in (1, -1)]
+        halves.append(np.minimum(*sides))
+    return 2.0 * float(np.median(np.concatenate([*halves, [width_px / 2]])))
+
+
+def _half_width(edge_map, points, directions, reach):
+    """(n,) px from points (n, 2) on ridges along unit `directions` to half of the map's value; `reach` if beyond."""
+    if not len(points):
+        return np.zeros(0)
+    along = np.arange(0, reach + PROFILE_STEP, PROFILE_STEP)
+    places = (points[:, None] + along[:, None] * directions[:, None]).astype(np.float32)
+    profiles = cv2.remap(edge_map, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float64)
+    below = profiles < profiles[:, :1] / 2
+    first, rows = below.argmax(axis=1), np.arange(len(points))
+    before, after, half = profiles[rows, first - 1], profiles[rows, first], profiles[:, 0] / 2
+    crossing = along[first] - PROFILE_STEP * (half - after) / np.maximum(before - after, 1e-9)
+    return np.where(below.any(axis=1), crossing, reach)

@@ -63,14 +63,19 @@ def whole_edges(shapes, matching):
     Free ends are extended only when it is known which are free, and then some more strokes continue each other.
     """
     pixel, seen = matching.pixel, partial(support_along, matching)
-    noise = np.hypot(NOISE_PX, support_of(matching, shapes).noise_px)
-    yardstick = Yardstick(noise * pixel, STRETCH_PX * pixel)
+    yardstick = yardstick_of(shapes, matching)
     shapes, first = continued(shapes, yardstick, pixel, seen)
     kept = with_support(matching, shapes)
     longer, second = continued(with_longer_ends(matching, kept), yardstick, pixel, seen, WIDE_GAP_PX)
     found = with_support(matching, longer)
     merging = Merging(*(sum(pair) for pair in zip(astuple(first), astuple(second), strict=True)))
     return found, merging, len(shapes) - len(kept) + len(longer) - len(found)
+
+
+def yardstick_of(shapes, matching):
+    """The Yardstick of strokes: the noise of their edgels, and by how much edges are off beyond it."""
+    noise = np.hypot(NOISE_PX, support_of(matching, shapes).noise_px)
+    return Yardstick(noise * matching.pixel, STRETCH_PX * matching.pixel)
 
 
 def related(wireframe, matching, impose):
