@@ -22,8 +22,7 @@ TIE_PX = 0.1  # beyond its ends an edge must be nearer to an edgel than its neig
 CHORDS = 64  # for each cubic: where places at equal distances along a shape are looked for
 CORE, CORE_ROUNDS = 3.0, 8  # standard deviations of the core; rounds in which it is found
 TIE_NOISES = 3.0  # of the noise: what cannot make the worse of two edges the nearer one
-ABOUT_PX = 3.0  # from an edge: where its edgels would be if it moved with the viewpoint
-SEEN_TOGETHER = 0.25  # of the views of two edges beside each other, at least
+ABOUT, MOST_ABOUT_PX = 6.0, 4.0  # an edgel within so many times the distance at which it is on an edge is about it
 PLANES = 2  # those of two views always meet
 
 
@@ -158,20 +157,6 @@ class Support:
         return noise if len(residuals) else 0.0
 
     @cached_property
-    def together(self):
-        """(E, E) share of the views that see the one or the other of two edges, whichever fewer see, that see both.
-
-        A view sees an edge by the share of its length where it has edgels of it. 0 for an edge with itself.
-        """
-        counts = np.maximum(np.diff(self.samples.starts), 1)
-        seen = self.samples.sums(self.edgels >= 0) / counts[:, None]  # (E, V)
-        both = np.array([np.minimum(seen, row).sum(axis=1) for row in seen]).reshape(len(seen), len(seen))
-        total = seen.sum(axis=1)
-        shares = both / np.maximum(np.minimum(total, total[:, None]), 1e-9)
-        np.fill_diagonal(shares, 0.0)
-        return shares
-
-    @cached_property
     def supported_lengths(self):
         """(E,) length that LEAST_VIEWS views see, each counted by its weight."""
         return self.samples.sums(self.samples.lengths * (self.views >= LEAST_VIEWS))
@@ -231,20 +216,18 @@ def evidence_of(support):
 
 
 def steadiness(matching, support):
-    """(E,) share of the edgels about each edge that lie on it, of those that no other edge explains.
+    """(E,) share of the edgels about each edge that lie on it, of those that no other edge owns.
 
     An edge stays where it is as the viewpoint moves. The occluding contour of a smooth surface leaves any line in
-    space, so that its edgels lie all around. Several lines along one contour would explain each other's edgels; but a
-    view shows the contour in one place, and no two of these lines at once. So of edges that are never seen together,
-    none explains the edgels of another. matching: EdgelMatching. support: Support of the edges.
+    space, so that its edgels lie all around. matching: EdgelMatching. support: Support of the edges.
     """
     samples, tight = support.samples, max(TIGHT_PX, TIGHT_NOISES * support.noise_px)
+    about = min(ABOUT * tight, MOST_ABOUT_PX)
     views = slice(0, matching.edgels.view_count)
-    edgels, residuals, _ = matching.matches(samples.points, samples.directions, views, ABOUT_PX)
-    owners = np.append(support.claims.owners, -1)[edgels]
-    explained = np.append(support.together >= SEEN_TOGETHER, np.zeros((len(support.together), 1), bool), axis=1)
-    mine = (edgels >= 0) & ~explained[samples.edges[:, None], owners]
-    on = mine & (owners == samples.edges[:, None]) & (np.abs(residuals) <= tight)
+    edgels, residuals, _ = matching.matches(samples.points, samples.directions, views, about)
+    owners = np.append(support.claims.owners, len(samples.starts))[edgels]
+    mine = (edgels >= 0) & ((owners < 0) | (owners == samples.edges[:, None]))
+    on = mine & (np.abs(residuals) <= tight)
     return samples.sums(on.sum(axis=1)) / np.maximum(samples.sums(mine.sum(axis=1)), 1)
 
 

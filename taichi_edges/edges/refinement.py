@@ -19,7 +19,7 @@ NOISE_PX = 0.2  # by which an edge is off its shape, beyond the noise: next to o
 STRETCH_PX = 4.0  # length of an edge on which the errors go together
 WIDE_GAP_PX = 24.0  # between strokes that continue each other, where their ends are still free after the first pass
 MOST_COMPARED = 150  # edges whose relations are counted where nobody asked for them: there are as many as its square
-LEAST_STEADY = 0.63  # share of the edgels about an edge that lie on it; contours have half
+LEAST_STEADY = 0.66  # share of the edgels about an edge that lie on it; contours have half
 LENIENT = 0.75  # of that, for edges that have not been adjusted
 LEAST_SUPPORTED = 0.33  # of the length of an edge; where edges touch, only one of them owns the edgels
 
