@@ -187,7 +187,7 @@ class FilterConfig(Section):
         0.54, description="refine: share of the unexplained edgels near a point that lie on it, relative to sure edges"
     )
     min_evidence: NotNegative = Field(
-        1.5, description="refine: that an edge is no passing contour, log likelihood ratio from its views"
+        0.7, description="refine: that an edge is no passing contour, log likelihood ratio from its views"
     )
     harvest: bool = Field(True, description="refine: look once more for edges seen in few views")
     grow: Share = Field(0.2, description="refine: continue edges where this share of the views agrees; 0: do not")

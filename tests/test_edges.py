@@ -30,10 +30,10 @@ from taichi_edges.edges.clustering import (
 from taichi_edges.edges.filtering import filter_points, statistical_inliers
 from taichi_edges.edges.fitting import (
     BENDING,
-    _lsq_chain,
     fit_cluster,
     fit_curve,
     fit_line,
+    lsq_chain,
     nearest_on_chain,
     wireframe_of,
 )
@@ -426,7 +426,7 @@ def test_the_chain_is_the_b_spline_with_double_knots(generator, pieces):
     targets = np.concatenate([points * np.sqrt(weights)[:, None], np.zeros((2 * pieces, 3))])
     spline = BSpline(knots, np.linalg.lstsq(np.concatenate([design, bend]), targets, rcond=None)[0], 3)
     within = np.linspace(0, 1, 11)[:-1]
-    found = evaluate_bezier(_lsq_chain(parameters, points, weights, pieces), within)
+    found = evaluate_bezier(lsq_chain(parameters, points, weights, pieces), within)
     np.testing.assert_allclose(found, spline(np.arange(pieces)[:, None] + within), atol=1e-9)
 
 
