@@ -57,6 +57,18 @@ def test_missing_line_is_found(taichi, generator, seed):
     np.testing.assert_array_equal(found.vertices, wireframe.vertices)
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+def test_missing_lines_do_not_lie_on_each_other(taichi, generator, seed):
+    """The images show a line from tip to tip, and a third vertex lies on it: two lines meet there, and no third one."""
+    wireframe, tips = bridge(generator)
+    middle, far = tips.mean(axis=0), turned(np.array([[0.44, 0.6, 0.5], [0.47, 0.3, 0.6]]), generator)
+    vertices = np.concatenate([wireframe.vertices, middle[None], far])
+    stems = tuple(Edge(Line(vertices[[6, end]]), (6, end)) for end in (7, 8))
+    wireframe = Wireframe(vertices, wireframe.edges + stems, wireframe.contacts)
+    found, _ = completed(wireframe, matching_of([*wireframe.shapes, Line(tips)], generator))
+    assert (0, 1) not in {tuple(sorted(edge.vertices)) for edge in found.edges}
+
+
 @pytest.mark.parametrize("hidden", [0.2, 0.4])
 def test_missing_line_may_be_hidden_in_some_views(taichi, generator, hidden):
     wireframe, tips = bridge(generator)

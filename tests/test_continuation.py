@@ -187,11 +187,33 @@ def test_every_stroke_is_in_one_path_once(generator, seed):
     round = [part(arc(0, 2 * np.pi, 0.05), a, a + 0.33) for a in (0, 1 / 3, 2 / 3)]
     strokes, _ = strokes_of([*pieces, *round, WHOLE["line"], any_shape("circle", generator)], generator)
     paths = smooth_paths(strokes, YARDSTICK, PIXEL, 12.0)
-    assert sorted(number for path in paths for number, _ in path) == list(range(len(strokes)))
-    assert sorted(len(path) for path in paths) == [1, 1, 3, 3]
-    for path in paths:
+    assert sorted(number for path, _ in paths for number, _ in path) == list(range(len(strokes)))
+    assert sorted((len(path), closes) for path, closes in paths) == [(1, False), (1, False), (3, False), (3, True)]
+    for path, _ in paths:
         ends = [strokes[number].ends[::-1] if turned else strokes[number].ends for number, turned in path]
         assert all(np.linalg.norm(a[1] - b[0]) < 12 * PIXEL for a, b in zip(ends, ends[1:]))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("pieces", [1, 2, 3])
+def test_strokes_that_come_back_to_their_start_are_one_ellipse(generator, pieces, seed):
+    """Chains of cubics with gaps between them, also between the two ends of a single one."""
+    whole = EllipticArc(np.zeros(3), np.array([[0.2, 0, 0], [0, 0.11, 0]]), 0.0, 2 * np.pi)
+    joints = np.linspace(0.3, 0.3 + 2 * np.pi, pieces + 1)
+    strokes = [Spline(whole.over(low + 0.02, high - 0.02).cubics()) for low, high in zip(joints, joints[1:])]
+    strokes, placing = strokes_of(strokes, generator)
+    found, _ = continued(strokes, YARDSTICK, PIXEL, everywhere)
+    assert [shape.kind for shape in found] == ["ellipse"]
+    np.testing.assert_allclose(found[0].radii, [0.2, 0.11], atol=NOISE)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_strokes_round_a_gap_that_no_image_shows_stay_open(generator, seed):
+    whole = EllipticArc(np.zeros(3), np.array([[0.2, 0, 0], [0, 0.11, 0]]), 0.0, 2 * np.pi)
+    stroke = whole.over(0.05, 2 * np.pi - 0.05)  # a gap of 4.4 px
+    strokes, _ = strokes_of([Spline(stroke.cubics())], generator)
+    found, _ = continued(strokes, YARDSTICK, PIXEL, only_along(*strokes))
+    assert len(found) == 1 and not found[0].closed
 
 
 # ------------------------------------------------------------------------------------------------------------ circles
@@ -323,5 +345,5 @@ def test_continued_edges_stay_as_they_are(generator):
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_hardly_anything_to_continue(generator, count):
-    strokes = [any_shape("spline", generator)] * count
+    strokes = [any_shape("arc", generator)] * count
     assert continued(strokes, YARDSTICK, PIXEL, everywhere) == (strokes, Merging())

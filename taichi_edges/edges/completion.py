@@ -33,12 +33,15 @@ def completed(wireframe, matching):
         places = clear_places(line, matching.pixel)
         views = support_along(matching, line, places, claims)
         if (views >= LEAST_VIEWS).mean() >= SHOWN and steadiness(matching, line, places, claims) >= STEADY:
-            if not repeats(line, wireframe.shapes, matching.pixel):
-                found.append((float(views.mean()), first, second))
+            found.append((float(views.mean()), first, second))
     edges = list(wireframe.edges)
     for _, first, second in sorted(found, reverse=True):
-        edges.append(Edge(Line(wireframe.vertices[[first, second]]), (first, second)))
-    return Wireframe(wireframe.vertices, tuple(edges), wireframe.contacts), len(found)
+        line = Line(wireframe.vertices[[first, second]])
+        others = np.delete(wireframe.vertices, [first, second], axis=0)
+        passes = len(others) and distances_to(line, others).min() <= matching.pixel  # two lines meet there, if any
+        if not passes and not repeats(line, [edge.shape for edge in edges], matching.pixel):
+            edges.append(Edge(line, (first, second)))
+    return Wireframe(wireframe.vertices, tuple(edges), wireframe.contacts), len(edges) - len(wireframe)
 
 
 def repeats(line, shapes, pixel):

@@ -5,7 +5,7 @@ smoothly form a path, and the path is cut anew into as few shapes as pay (`model
 over all ways to cut it. A stroke that lies beside others on its whole length repeats them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -29,6 +29,8 @@ JOINT_COSINE = np.cos(np.radians(25.0))  # between the tangents of two strokes t
 JOINT_GAP_PX = 12.0  # between their ends, along; a tail or a gap at a touching edge is as long
 JOINT_ASIDE = 0.25  # of that gap: how far aside the other end may lie, beyond BESIDE
 SPACING_PX = 2.0  # of the places by which strokes are compared
+ROUNDING = 1e-9  # relative; what is cheaper by no more is not cheaper
+LEAST_LOOP = 4.0  # times that gap: length of a stroke whose end may continue its start
 LONGEST_RUN = 8  # strokes that may become one at once
 FOLLOWED = 0.5  # of the places of a stroke that the shape which replaces it runs along, at least
 CHORDS = 512  # of a shape, for its tangents
@@ -118,7 +120,7 @@ def goes_on(shape, places, pixel, seen, least=0.0):
     count = max(int(np.ceil(shape.length / pixel)), 8)
     parameters = (np.arange(count) + 0.5) / count
     covered = cKDTree(places).query(shape.at(parameters))[0] <= SPACING_PX * pixel
-    if covered.all() or covered.mean() < least:
+    if covered.all() or covered.mean() < least or not covered.any():
         return bool(covered.all())
     views = seen(shape, parameters)
     usual = np.median(views[covered])
@@ -150,12 +152,28 @@ def on_shape(shape, track, yardstick):
 
 def rejoined(shapes, yardstick, pixel, seen, gap_px=JOINT_GAP_PX):
     """The shapes, each path of strokes that continue each other cut anew into as few as pay."""
-    paths = smooth_paths(shapes, yardstick, pixel, gap_px)
-    return [shape for path in paths for shape in cut_anew(shapes, path, yardstick, pixel, seen)]
+    whole = []
+    for path, closes in smooth_paths(shapes, yardstick, pixel, gap_px):
+        tracks = [oriented(track_of(shapes[number], SPACING_PX * pixel), backward) for number, backward in path]
+        loop = closed_shape([shapes[number] for number, _ in path], tracks, yardstick, pixel, seen) if closes else None
+        whole += [loop] if loop is not None else cut_anew([shapes[n] for n, _ in path], tracks, yardstick, pixel, seen)
+    return whole
+
+
+def closed_shape(parts, tracks, yardstick, pixel, seen):
+    """The closed shape of strokes that follow each other back to the first one, or None where none is cheaper."""
+    track = replace(joined_track(tracks), closed=True)
+    count = observations(track.share, yardstick)
+    worth = np.log(count) * sum(price_of(part) for part in parts)
+    shape, _ = best_shape(track, yardstick, count, worth)
+    return shape if shape is not None and replaces(shape, tracks, yardstick, pixel, seen) else None
 
 
 def smooth_paths(shapes, yardstick, pixel, gap_px):
-    """Lists of (index, reversed) of strokes that continue each other; every shape is in one of them."""
+    """Lists of (index, reversed) of strokes that continue each other, and whether they come back to their start.
+
+    Every shape is in one of them.
+    """
     partner = joints(shapes, yardstick, pixel, gap_px)
     paths, seen = [], set()
     ends = [(number, side) for number, shape in enumerate(shapes) for side in (0, 1)]
@@ -163,15 +181,13 @@ def smooth_paths(shapes, yardstick, pixel, gap_px):
     for number, side in starts:
         if number in seen:
             continue
-        path = []
-        while number not in seen:
+        path, start, onward = [], (number, side), (number, side)
+        while onward is not None and onward[0] not in seen:
+            number, side = onward
             seen.add(number)
             path.append((number, side == 1))
             onward = partner.get((number, 1 - side))
-            if onward is None:
-                break
-            number, side = onward
-        paths.append(path)
+        paths.append((path, onward == start))
     return paths
 
 
@@ -184,7 +200,8 @@ def joints(shapes, yardstick, pixel, gap_px):
     outward = np.array([(2 * side - 1) * shapes[number].tangents(float(side)) for number, side in ends])
     found = []
     for i, j in sorted(cKDTree(places).query_pairs(gap_px * pixel)):
-        if ends[i][0] == ends[j][0] or outward[i] @ outward[j] > -JOINT_COSINE:
+        same = ends[i][0] == ends[j][0] and shapes[ends[i][0]].length < LEAST_LOOP * gap_px * pixel
+        if same or outward[i] @ outward[j] > -JOINT_COSINE:
             continue
         step = places[j] - places[i]
         along = unit(outward[i] - outward[j])
@@ -199,24 +216,24 @@ def joints(shapes, yardstick, pixel, gap_px):
     return partner
 
 
-def cut_anew(shapes, path, yardstick, pixel, seen):
-    """The shapes that describe a path with the least cost (BIC), each over a run of its strokes."""
-    if len(path) == 1:
-        return [shapes[path[0][0]]]
-    tracks = [oriented(track_of(shapes[number], SPACING_PX * pixel), backward) for number, backward in path]
+def cut_anew(parts, tracks, yardstick, pixel, seen):
+    """The shapes that describe a path with the least cost (BIC), each over a run of its strokes.
+
+    parts: the shapes of the strokes, in the order of the path. tracks: their Tracks, in its direction.
+    """
     count = observations(np.concatenate([track.share for track in tracks]), yardstick)
     least, choice = [0.0], []
-    for last, (number, _) in enumerate(path):
-        shape = shapes[number]
+    for last, shape in enumerate(parts):
         best = (least[last] + price_of(shape) * np.log(count), last, shape)
-        for first in range(last - 1, max(0, last - LONGEST_RUN + 1) - 1, -1):
+        for first in range(last, max(0, last - LONGEST_RUN + 1) - 1, -1):
             run = tracks[first : last + 1]
-            shape, cost = best_shape(joined_track(run), yardstick, count, best[0] - least[first])
+            worth = (best[0] - least[first]) * (1 - ROUNDING)
+            shape, cost = best_shape(joined_track(run), yardstick, count, worth)
             if shape is not None and replaces(shape, run, yardstick, pixel, seen):
                 best = (least[first] + cost, first, shape)
         least.append(best[0])
         choice.append(best[1:])
-    cut, last = [], len(path) - 1
+    cut, last = [], len(parts) - 1
     while last >= 0:
         first, shape = choice[last]
         cut.append(shape)

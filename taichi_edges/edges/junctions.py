@@ -12,9 +12,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from taichi_edges.edges.arcs import through_three
-from taichi_edges.edges.fitting import fit_chain, lsq_chain, nearest_on_chain
+from taichi_edges.edges.fitting import lsq_chain, nearest_on_chain
 from taichi_edges.edges.model_selection import distances_to, track_of
-from taichi_edges.edges.ordering import Ordering
 from taichi_edges.shapes import EllipticArc, Line, Spline, bounds_of, near_bounds
 from taichi_edges.wireframe import Edge, Wireframe
 
@@ -24,6 +23,7 @@ MEETING_PX = 1.0  # edges that meet come as near as that
 SHARE = 0.4  # of an edge's length: its ends do not move inwards by more
 TANGENTIAL = np.cos(np.radians(18.0))  # edges that meet at a smaller angle run into each other
 LEVER_PX = 4.0  # how far apart in space two tangents count that differ by a radian
+CHAIN_ROUNDS = 3  # in which the places of points on a chain settle
 END_WEIGHT = 1e3  # of the ends of a chain against the points between them
 FAR_ASIDE_PX, FAR_ALONG_PX = 0.3, 3.0  # usual errors of an end, across and along; pairs that ask for less go first
 FRUGAL = 0.05  # weight of the way of an end against the distance that it leaves
@@ -254,22 +254,28 @@ def spline_between(shape, ends, pixel):
     heading = np.array([shape.tangents(0.0), shape.tangents(1.0)])
     beyond = ((ends - shape.ends) * heading).sum(axis=1)  # by how much the chain grows at its end, shrinks at its start
     inside = (track.arc > beyond[0]) & (track.arc < shape.length + beyond[1])
-    arc = np.concatenate([[beyond[0]], track.arc[inside], [shape.length + beyond[1]]])
     points = np.concatenate([ends[:1], track.points[inside], ends[1:]])
-    ordering = Ordering(arc - arc[0], float(arc[-1] - arc[0]), False)
-    curves, _ = fit_chain(points, ordering, pixel, len(shape.curves))
-    return Spline(chain_between(points, curves))
+    count = len(shape.curves)
+    parameters = nearest_on_chain(points, shape.curves)[1]
+    speeds = 3.0 * np.linalg.norm(shape.curves[[0, -1], [1, 3]] - shape.curves[[0, -1], [0, 2]], axis=1)
+    for at, end in ((0, 0.0), (-1, float(count))):
+        if beyond[at] * (1 if at else -1) > 0:  # a parameter goes on beyond its end at the pace that it has there
+            parameters[at] = end + beyond[at] / max(speeds[at], 1e-300)
+    parameters = (parameters - parameters[0]) / (parameters[-1] - parameters[0]) * count
+    return Spline(chain_between(points, parameters, count))
 
 
-def chain_between(points, curves):
-    """A chain of cubics fitted once more to the points, so that it starts and ends in the first and the last of them.
+def chain_between(points, parameters, count):
+    """A chain of cubics that starts and ends in the first and the last of (n, 3) points and follows the others.
 
-    points: (n, 3) in order. curves: (c, 4, 3) near them. A heavy weight moves the ends, the rest of the way is nothing.
+    parameters: (n,) where the points are on it, ascending, 0 to count. A heavy weight moves the ends, the rest of the
+    way is nothing.
     """
-    parameters = nearest_on_chain(points, curves)[1]
-    parameters[0], parameters[-1] = 0.0, len(curves)
     weights = np.ones(len(points))
     weights[[0, -1]] = END_WEIGHT
-    curves = lsq_chain(parameters, points, weights, len(curves))
+    for _ in range(CHAIN_ROUNDS):
+        curves = lsq_chain(parameters, points, weights, count)
+        parameters = nearest_on_chain(points, curves)[1]
+        parameters[0], parameters[-1] = 0.0, count
     curves[0, 0], curves[-1, 3] = points[0], points[-1]
     return curves

@@ -52,7 +52,8 @@ class Track:
     @property
     def ordering(self):
         """The same as an Ordering."""
-        return Ordering(self.arc - self.arc[0], float(self.arc[-1] - self.arc[0]), self.closed)
+        closing = float(np.linalg.norm(self.points[0] - self.points[-1])) if self.closed else 0.0
+        return Ordering(self.arc - self.arc[0], float(self.arc[-1] - self.arc[0]) + closing, self.closed)
 
 
 def price_of(shape):

@@ -1,6 +1,6 @@
 """From single edges to a wireframe: connected, minimal, in agreement with the images."""
 
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import asdict, astuple, dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -17,6 +17,7 @@ from taichi_edges.kernels.edgel_matching import EdgelMatching
 
 NOISE_PX = 0.2  # by which an edge is off its shape, beyond the noise: next to other edges every detector is biased
 STRETCH_PX = 4.0  # length of an edge on which the errors go together
+LEAST_LENGTH_PX = 0.1  # of a stroke; a shorter one has no direction
 WIDE_GAP_PX = 24.0  # between strokes that continue each other, where their ends are still free after the first pass
 MOST_COMPARED = 150  # edges whose relations are counted where nobody asked for them: there are as many as its square
 LEAST_STEADY = 0.66  # share of the edgels about an edge that lie on it; contours have half
@@ -49,12 +50,14 @@ def refine_wireframe(loose, views, config):
     if not config.enabled or not len(loose):
         return loose, RefineCounts()
     matching = EdgelMatching(views)
-    shapes, merging, unsupported = whole_edges(loose.shapes, matching)
+    strokes = [shape for shape in loose.shapes if shape.length >= LEAST_LENGTH_PX * matching.pixel]
+    shapes, merging, unsupported = whole_edges(strokes, matching)
     wireframe, lines = completed(connected(shapes, matching.pixel), matching)
     wireframe, relations = related(adjusted(wireframe, matching), matching, config.regularise)
     judged = with_evidence(wireframe, matching)
     unsupported += len(wireframe) - len(judged)
-    return judged, RefineCounts(*astuple(merging), lines, unsupported, relations)
+    counts = RefineCounts(**asdict(merging), lines=lines, unsupported=unsupported, relations=relations)
+    return judged, counts
 
 
 def whole_edges(shapes, matching):
