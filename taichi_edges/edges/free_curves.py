@@ -12,7 +12,7 @@ from taichi_edges.edges.branches import separate_branches
 from taichi_edges.edges.claiming import OUTLIER, price
 from taichi_edges.edges.clustering import grow_clusters, members_of_clusters
 from taichi_edges.edges.fitting import POINTS_PER_PIECE, fewest_cubics, fit_chain, nearest_on_chain
-from taichi_edges.edges.merging import CUBIC_PRICE, NEXT_CUBIC_PRICE
+from taichi_edges.edges.model_selection import CUBIC_PRICE, NEXT_CUBIC_PRICE
 from taichi_edges.edges.ordering import order_points
 
 WITHIN = 0.9  # of a piece's points, which must be the chain's for the piece to be one of its own

@@ -16,10 +16,9 @@ from taichi_edges.edges.arc_growth import INLIER, SAGITTA, sagitta
 from taichi_edges.edges.arcs import Arc, fit_arc
 from taichi_edges.edges.claiming import OUTLIER, price
 from taichi_edges.edges.fitting import fit_chain, nearest_on_chain
+from taichi_edges.edges.model_selection import CUBIC_PRICE, MOST_CUBICS, NEXT_CUBIC_PRICE
 from taichi_edges.edges.ordering import Ordering
 
-CUBIC_PRICE, NEXT_CUBIC_PRICE = 12, 6  # free parameters of a cubic, and of one more in a smooth chain
-MOST_CUBICS = 4  # of an open curve
 WIDE = 4.0  # times the tolerance: the first fit to two pieces starts from one of them, and looks farther
 
 

@@ -20,6 +20,7 @@ STRETCH_PX = 4.0  # length of an edge on which the errors go together
 LEAST_LENGTH_PX = 0.1  # of a stroke; a shorter one has no direction
 WIDE_GAP_PX = 24.0  # between strokes that continue each other, where their ends are still free after the first pass
 MOST_COMPARED = 150  # edges whose relations are counted where nobody asked for them: there are as many as its square
+LEAST_CONFIDENCE = 0.2  # of an edge, see `evidence.evidence_of`
 LEAST_STEADY = 0.66  # share of the edgels about an edge that lie on it; contours have half
 LENIENT = 0.75  # of that, for edges that have not been adjusted
 LEAST_SUPPORTED = 0.33  # of the length of an edge; where edges touch, only one of them owns the edgels
@@ -93,9 +94,10 @@ def related(wireframe, matching, impose):
 def with_evidence(wireframe, matching):
     """The Wireframe with what the images say about each edge, and without those they do not support."""
     support = support_of(matching, wireframe.shapes)
-    pairs = zip(wireframe.edges, evidence_of(support), strict=True)
-    edges = tuple(replace(edge, evidence=found) for edge, found in pairs)
-    return replace(wireframe, edges=edges).keep(is_edge(matching, support, wireframe.shapes, LEAST_STEADY))
+    found = evidence_of(support)
+    edges = tuple(replace(edge, evidence=of) for edge, of in zip(wireframe.edges, found, strict=True))
+    sure = np.array([of.confidence >= LEAST_CONFIDENCE for of in found], dtype=bool)
+    return replace(wireframe, edges=edges).keep(sure & is_edge(matching, support, wireframe.shapes, LEAST_STEADY))
 
 
 def with_support(matching, shapes):
