@@ -217,7 +217,7 @@ class RefineConfig(Section):
 
     enabled: bool = Field(False, description="false: the edges stay as they were fitted")
     regularise: bool = Field(
-        False, description="make edges parallel, perpendicular, coplanar, coaxial, equal in radius where the images allow it"
+        False, description="make edges parallel, perpendicular, coplanar, coaxial, of equal radius, if images allow"
     )
 
 
