@@ -1,6 +1,10 @@
 """DXF and STEP hold exactly the edges that were written: other readers than ours say so."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,8 +19,9 @@ from taichi_edges.exporters.palette import KIND_COLOURS
 from taichi_edges.exporters.step import connected_parts, encoded, prefix_for, write_step
 from taichi_edges.shapes import EllipticArc, Line, Spline
 from taichi_edges.synthetic.parts import PARTS
-from taichi_edges.wireframe import Edge, Evidence, Wireframe, read_wireframe
+from taichi_edges.wireframe import Edge, Evidence, Wireframe, read_wireframe, write_wireframe
 
+ROOT = Path(__file__).parent.parent
 EXACT = 1e-9  # of the edges' size: sixteen digits go through a few products and, in DXF, through degrees
 PLANES = {
     "upright": ([1, 0, 0], [0, 1, 0]),
@@ -197,6 +202,23 @@ def test_the_same_edges_give_the_same_bytes(tmp_path, write):
     first, second = (write(tmp_path / name, house()).read_bytes() for name in ("a", "b"))
     assert first == second
     assert ezdxf.options.write_fixed_meta_data_for_testing == before
+
+
+@pytest.mark.parametrize("suffix", [".dxf", ".step"])
+def test_the_same_edges_give_the_same_bytes_in_every_process(tmp_path, suffix):
+    """Python orders sets of strings by a random number of the process."""
+    source = write_wireframe(tmp_path / "edges.json", house(), {})
+    code = (
+        "import sys; from taichi_edges.exporters import EXPORTERS; from taichi_edges.wireframe import read_wireframe; "
+        f"[EXPORTERS[{suffix!r}](path, read_wireframe(sys.argv[1])[0]) for path in sys.argv[2:]]"
+    )
+    written = set()
+    for number in ("1", "4"):  # ezdxf's own order differs between these
+        path = tmp_path / f"{number}{suffix}"
+        environment = {**os.environ, "PYTHONHASHSEED": number}
+        subprocess.run([sys.executable, "-c", code, source, path], check=True, cwd=ROOT, env=environment)
+        written.add(path.read_bytes())
+    assert len(written) == 1
 
 
 # ----------------------------------------------------------------------------------------------------------------- STEP
