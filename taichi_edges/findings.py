@@ -82,7 +82,10 @@ def describe_refine(facts):
     return (
         found
         + (f"; {changed}" if changed else "")
-        + left_out((facts["duplicates"], "duplicate"), (facts["unsupported"], "edge that no image shows"))
+        + left_out(
+            (facts["duplicates"], "duplicate"),
+            (facts["unsupported"], "edge without support in the images", "edges without support in the images"),
+        )
         + describe_relations(facts["relations"])
     )
 

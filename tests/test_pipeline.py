@@ -12,6 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -23,6 +24,7 @@ from scipy.spatial import cKDTree
 from taichi_edges.artefacts import digest_file, remove_unfinished, replacing
 from taichi_edges.cameras import Similarity, invert_pose
 from taichi_edges.edge_set import EdgeSet, read_edges, write_edges
+from taichi_edges.edges.refinement import RefineCounts
 from taichi_edges.errors import UserError
 from taichi_edges.exporters.point_cloud import read_oriented_points
 from taichi_edges.exporters.splats import read_gaussians
@@ -322,6 +324,9 @@ def test_every_stage_can_say_what_it_found():
     fit = {"lines": 1, "curves": 2, "loop_clusters": 1, "short_clusters": 3, "degenerate_clusters": 0}
     assert FINDINGS["fit"](fit) == "1 line and 2 curves (1 closed edge); left out: 3 clusters that are too short"
     assert "no ground truth" in FINDINGS["evaluate"]({"ground_truth": None})
+    refined = {"edges": 1, "vertices": 2, **asdict(RefineCounts(duplicates=1, unsupported=2))}
+    left_out = "left out: 1 duplicate, 2 edges without support in the images"
+    assert FINDINGS["refine"](refined) == f"1 edge, 2 vertices; {left_out}"
 
 
 # --------------------------------------------------------------------------------------- skipping and running again
