@@ -23,6 +23,7 @@ from scipy.spatial import cKDTree
 
 from taichi_edges.artefacts import digest_file, remove_unfinished, replacing
 from taichi_edges.cameras import Similarity, invert_pose
+from taichi_edges.command import print_summary
 from taichi_edges.edge_set import EdgeSet, read_edges, write_edges
 from taichi_edges.edges.refinement import RefineCounts
 from taichi_edges.errors import UserError
@@ -387,6 +388,23 @@ def test_stage_starts_there_and_reuses_what_is_before(copied):
 def test_until_stops_there(copied):
     record, said = rerun(copied, ["cluster.max_gap=0.08"], until="cluster")
     assert set(said.states()) == {"prepare", "train", "cluster"} and record["ran"] == ["cluster"]
+
+
+@pytest.mark.parametrize(
+    ("until", "results"),
+    [
+        ("prepare", ["detection.png"]),
+        ("cluster", ["detection.png"]),
+        ("fit", ["edges_fit.json", "detection.png"]),
+        ("refine", ["edges.json", "detection.png"]),
+        ("evaluate", ["edges.json", "detection.png"]),
+    ],
+)
+def test_summary_names_the_edges_as_far_as_they_have_come(copied, capsys, until, results):
+    scene, runs, folder = copied
+    record, _ = rerun(copied, until=until)
+    print_summary(Run(load_scene(scene), folder), record, until)
+    assert capsys.readouterr().out.splitlines()[-1] == f"results: {folder}/  ({', '.join(results)})"
 
 
 def test_stage_and_until_name_one_stage(copied):
