@@ -19,6 +19,7 @@ from taichi_edges.artefacts import replacing, write_json, write_text
 from taichi_edges.cameras import transform
 from taichi_edges.edge_set import read_edges, write_edges
 from taichi_edges.errors import UserError, did_you_mean
+from taichi_edges.findings import amount
 from taichi_edges.views import read_views, write_views
 from taichi_edges.wireframe import read_wireframe, write_wireframe
 
@@ -324,9 +325,12 @@ def refine(run):
     views = read_views(run.path("views.npz"))
     loose, about = read_wireframe(run.path("edges_fit.json"))
     loose = loose.transformed(views.similarity.to_unit, views.similarity.scale)
-    if not is_running(run.arch, run.threads):
+    if run.config.refine.enabled and len(loose) and not is_running(run.arch, run.threads):
         start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)
     wireframe, counts = refine_wireframe(loose, views, run.config.refine)
+    if len(loose) and not len(wireframe):
+        found = f"the images support none of the {amount(len(loose), 'edge')} that were fitted"
+        run.progress.warn(f"{found}; look at detection.png, or set refine.enabled: false to keep them")
     write_wireframe(run.path("edges.json"), _in_input_frame(wireframe, views), about)
     return {"edges": len(wireframe), "vertices": len(wireframe.vertices), **asdict(counts)}
 
