@@ -64,14 +64,11 @@ def print_summary(run, record, until=None):
         seconds = f"{stage['seconds']:.1f} s" + ("" if name in record["ran"] else " (earlier)")
         rows.append((name, seconds, f"{stage['peak_memory_mib']:.0f} MiB"))
     if "evaluate" in done:
-        from taichi_edges.evaluation.metrics import metrics_rows
+        from taichi_edges.evaluation.metrics import metrics_rows, rows_alone
 
         metrics = record["stages"]["evaluate"]["facts"]
-        if metrics["ground_truth"] is None:
-            found = [("lines", str(metrics["lines"])), ("curves", str(metrics["curves"])), ("ground truth", "none")]
-        else:
-            found = metrics_rows(metrics)
-        _print_table(f"{run.config.name}: metrics", ("metric", "value"), found)
+        found = rows_alone if metrics["ground_truth"] is None else metrics_rows
+        _print_table(f"{run.config.name}: metrics", ("metric", "value"), found(metrics))
     _print_table(f"{run.config.name}: stages", ("stage", "time", "peak memory"), rows)
     files = ", ".join(result_files(record["stages"], done))
     print(f"results: {run.folder}/" + (f"  ({files})" if files else ""))

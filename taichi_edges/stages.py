@@ -343,16 +343,19 @@ def truth_path(run):
 
 
 def evaluate(run):
-    """`edges.json` and the ground truth -> `metrics.json` and `metrics.csv` (EMAP's protocol)."""
+    """`edges.json` -> `metrics.json` and `metrics.csv`: EMAP's protocol, corners, free ends; without a truth fewer.
+
+    Lengths are in the frame of the truth, in the unit cube where there is none.
+    """
     from taichi_edges.evaluation.ground_truth import read_ground_truth
     from taichi_edges.evaluation.metrics import evaluate as measure
+    from taichi_edges.evaluation.metrics import measure_alone
 
     edges, _ = read_edges(run.path("edges.json"))
-    path = truth_path(run)
+    views, path = read_views(run.path("views.npz")), truth_path(run)
     if path is None:
-        metrics = {"lines": len(edges.lines), "curves": len(edges.curves), "ground_truth": None}
+        metrics = {**measure_alone(edges.transformed(views.similarity.to_unit)), "ground_truth": None}
     else:
-        views = read_views(run.path("views.npz"))
         to_truth, from_truth = views.input_to_truth, np.linalg.inv(views.input_to_truth)
         truth = read_ground_truth(path, lambda points: views.similarity.to_unit(transform(from_truth, points)))
         into_frame = partial(transform, to_truth) if truth.own_frame else views.similarity.to_unit

@@ -221,6 +221,26 @@ def test_metrics_do_not_depend_on_the_units_of_the_input(tmp_path):
     assert metrics["true_length_units"] == pytest.approx(0.8)
 
 
+def test_without_a_truth_the_edges_are_measured_alone(tmp_path, capsys):
+    """In the unit cube, whatever the units of the input."""
+    similarity, pose = Similarity(1.0 / 800.0, (0.1, 0.2, 0.3)), np.eye(3, 4)[None]
+    views = Views(("v",), np.zeros((1, 4, 4), np.uint8), np.eye(3)[None], pose, ("",), similarity)
+    write_views(tmp_path / "views.npz", views)
+    lines = similarity.to_input([[[0.1, 0.2, 0.3], [0.9, 0.2, 0.3]], [[0.9, 0.2, 0.3], [0.9, 0.5, 0.3]]])
+    write_edges(tmp_path / "edges.json", EdgeSet.of(lines), {"units": "input"})
+    run = Run(check_scene({"source": {"reader": "nerf", "path": "unused"}}, "test"), tmp_path)
+    metrics = evaluate(run)
+    assert metrics["ground_truth"] is None and metrics["predicted_length_units"] == pytest.approx(1.1)
+    assert (metrics["lines"], metrics["curves"], metrics["edges"], metrics["free_ends"]) == (2, 0, 2, 2)
+    with open(tmp_path / "metrics.csv", newline="") as file:
+        assert ["free_ends", "2"] in list(csv.reader(file))
+    stages = {"prepare": {"facts": {"files": []}}, "evaluate": {"facts": metrics}}
+    for stage in stages.values():
+        stage |= {"seconds": 1.0, "peak_memory_mib": 1.0}
+    print_summary(run, {"stages": stages, "ran": []})
+    assert re.search(r"length +1\.10 units\n.*\n +free ends +2\n +ground truth +none\n", capsys.readouterr().out)
+
+
 def test_everything_exported_is_in_the_frame_of_the_input(finished, tmp_path):
     """The views of the finished run again, as a folder whose units are 2000 to the unit cube, centred at zero."""
     scene, runs, _ = finished
