@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import asdict
+from importlib.metadata import version
 from pathlib import Path
 
 import cv2
@@ -392,6 +393,18 @@ def test_a_stage_whose_inputs_come_out_the_same_is_skipped(copied):
     assert said.states() == states(
         ran=("cluster",), skipped=("prepare", "train", "fit", "refine", "evaluate", "export")
     )
+
+
+def test_another_version_of_a_package_makes_those_stages_stale_that_use_it(copied, monkeypatch):
+    """A new ezdxf writes another DXF; nothing is trained again for it."""
+    from taichi_edges import pipeline
+
+    monkeypatch.setattr(pipeline, "version", lambda name: "99.0" if name == "ezdxf" else version(name))
+    pipeline._versions.cache_clear()
+    record, said = rerun(copied)
+    pipeline._versions.cache_clear()
+    assert record["ran"] == ["export"] and record["versions"]["ezdxf"] == "99.0"
+    assert any("export again" in line and "the version of ezdxf was" in line for line in said.lines)
 
 
 def test_stage_starts_there_and_reuses_what_is_before(copied):
