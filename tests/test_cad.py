@@ -266,7 +266,7 @@ def test_step_edges_share_their_vertices_and_are_named(tmp_path):
     assert sorted(meeting.count(vertex) for vertex in set(meeting)) == [1, 1, 1, 2, 2, 2, 2]
     assert edges[4].vertices == (edges[2].vertices[1], edges[0].vertices[0])
     assert edges[5].vertices[0] == edges[5].vertices[1]  # the circle's own
-    assert sets == connected_parts(house()) == [[0, 1, 2, 4], [3], [5]]
+    assert sets == connected_parts(house()) == [[0, 1, 2, 4], [3], [5]]  # edge 3 touches 0 between its ends
     names = [edge.name for edge in edges]
     assert names[:2] == [
         f"line_{i}, confidence 0.50, {w}, residual 0.21 px" for i, w in enumerate(("1 view", "2 views"))
