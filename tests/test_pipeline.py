@@ -345,7 +345,8 @@ def test_every_stage_can_say_what_it_found():
     assert list(FINDINGS) == list(STAGES)
     fit = {"lines": 1, "curves": 2, "loop_clusters": 1, "short_clusters": 3, "degenerate_clusters": 0}
     assert FINDINGS["fit"](fit) == "1 line and 2 curves (1 closed edge); left out: 3 clusters that are too short"
-    assert "no ground truth" in FINDINGS["evaluate"]({"ground_truth": None})
+    alone = {"edges": 2, "predicted_length_units": 1.5, "free_ends": 1, "ground_truth": None}
+    assert FINDINGS["evaluate"](alone) == "2 edges, 1.50 units long, 1 free end; there is no ground truth"
     refined = {"edges": 1, "vertices": 2, **asdict(RefineCounts(duplicates=1, unsupported=2))}
     left_out = "left out: 1 duplicate, 2 edges without support in the images"
     assert FINDINGS["refine"](refined) == f"1 edge, 2 vertices; {left_out}"
