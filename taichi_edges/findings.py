@@ -101,7 +101,7 @@ def describe_relations(relations):
 
 
 def describe_evaluate(facts):
-    """'F-score 72.6 % at 5 mm, 73.5 % at 10 mm, 74.6 % at 20 mm; 7 of 8 corners closed', '2 edges, ...' without truth."""
+    """'F-score 72.6 % at 5 mm, ..., 74.6 % at 20 mm; 7 of 8 corners closed'; '2 edges, ...' without truth."""
     if facts["ground_truth"] is None:
         length, ends = f"{facts['predicted_length_units']:.2f} units long", amount(facts["free_ends"], "free end")
         return f"{amount(facts['edges'], 'edge')}, {length}, {ends}; there is no ground truth"
