@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-NEAR = 0.01  # world units: nearer than this counts as behind the camera
+NEAR = 0.01  # unit-cube units: nearer than this counts as behind the camera
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # right-multiplies camera-to-world: flips the y and z camera axes
 

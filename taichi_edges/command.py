@@ -64,19 +64,22 @@ def print_summary(run, record, until=None):
         seconds = f"{stage['seconds']:.1f} s" + ("" if name in record["ran"] else " (earlier)")
         rows.append((name, seconds, f"{stage['peak_memory_mib']:.0f} MiB"))
     if "evaluate" in done:
-        from taichi_edges.evaluation.metrics import metrics_rows
+        from taichi_edges.evaluation.metrics import metrics_rows, rows_alone
 
         metrics = record["stages"]["evaluate"]["facts"]
-        if metrics["ground_truth"] is None:
-            found = [("lines", str(metrics["lines"])), ("curves", str(metrics["curves"])), ("ground truth", "none")]
-        else:
-            found = metrics_rows(metrics)
-        _print_table(f"{run.config.name}: metrics", ("metric", "value"), found)
+        found = rows_alone if metrics["ground_truth"] is None else metrics_rows
+        _print_table(f"{run.config.name}: metrics", ("metric", "value"), found(metrics))
     _print_table(f"{run.config.name}: stages", ("stage", "time", "peak memory"), rows)
-    written = ["edges.json", *record["stages"]["export"]["facts"]["files"]] if "export" in done else []
-    written += [name for name in record["stages"]["prepare"]["facts"]["files"] if name == "detection.png"]
-    files = ", ".join(name for name in written if "/" not in name)
+    files = ", ".join(result_files(record["stages"], done))
     print(f"results: {run.folder}/" + (f"  ({files})" if files else ""))
+
+
+def result_files(stages, done):
+    """What to open of the stages that are done: the edges as far as they have come, and what shows them."""
+    edges = [name for stage, name in (("fit", "edges_fit.json"), ("refine", "edges.json")) if stage in done][-1:]
+    exported = stages["export"]["facts"]["files"] if "export" in done else []
+    prepared = [name for name in stages["prepare"]["facts"]["files"] if name == "detection.png"]
+    return [name for name in (*edges, *exported, *prepared) if "/" not in name]
 
 
 def _print_table(title, headings, rows):

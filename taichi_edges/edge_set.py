@@ -1,4 +1,4 @@
-"""EdgeSet: the parametric edges themselves, their samples, and the file `edges.json`."""
+"""EdgeSet: edges as EMAP has them, lines and cubics, with their samples; and EMAP's keys of the file `edges.json`."""
 
 import json
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ class EdgeSet:
 
     lines:          (L, 2, 3) end points.
     curves:         (C, 4, 3) control points.
-    line_sources:   (L,) int, which cluster a line came from, or -1.
-    curve_sources:  (C,) int, the same for curves. Pieces of one smooth curve (a circle is several cubics) share the
-                    number, so counting distinct sources counts edges.
+    line_sources:   (L,) int, the number of the edge that a line is, or -1 where it is unknown.
+    curve_sources:  (C,) int, the same for curves. Pieces of one edge (a circle is several cubics) share the number, so
+                    counting distinct sources counts edges.
     """
 
     lines: np.ndarray
@@ -98,7 +98,7 @@ def read_edges(path):
         with open(path, encoding="utf-8") as file:
             content = json.load(file)
     except OSError as error:
-        raise UserError(f"{path}: {error.strerror}; an edge file is what the fit stage writes") from error
+        raise UserError(f"{path}: {error.strerror}; an edge file is what the refine stage writes") from error
     except ValueError as error:
         raise UserError(f"{path}: not an edge file, it cannot be read as JSON ({error})") from error
     if not isinstance(content, dict) or not {"lines_end_pts", "curves_ctl_pts"} <= set(content):
@@ -128,7 +128,7 @@ def _points(path, content, key, count):
 
 
 def _sources(path, content, key, count):
-    """Takes the cluster numbers of `count` edges out of an edge file's content."""
+    """Takes the edge numbers of `count` lines or curves out of an edge file's content."""
     values = content.pop(key)
     if not isinstance(values, list) or not all(type(value) is int for value in values):
         raise UserError(f"{path}: {key} must be a list of whole numbers, one for every edge")

@@ -82,7 +82,10 @@ def describe_refine(facts):
     return (
         found
         + (f"; {changed}" if changed else "")
-        + left_out((facts["duplicates"], "duplicate"), (facts["unsupported"], "edge that no image shows"))
+        + left_out(
+            (facts["duplicates"], "duplicate"),
+            (facts["unsupported"], "edge without support in the images", "edges without support in the images"),
+        )
         + describe_relations(facts["relations"])
     )
 
@@ -98,9 +101,10 @@ def describe_relations(relations):
 
 
 def describe_evaluate(facts):
-    """'F-score 72.6 % at 5 mm, 73.5 % at 10 mm, 74.6 % at 20 mm; 7 of 8 corners closed', or that there is no truth."""
+    """'F-score 72.6 % at 5 mm, ..., 74.6 % at 20 mm; 7 of 8 corners closed'; '2 edges, ...' without truth."""
     if facts["ground_truth"] is None:
-        return "no ground truth, so only the edges are counted"
+        length, ends = f"{facts['predicted_length_units']:.2f} units long", amount(facts["free_ends"], "free end")
+        return f"{amount(facts['edges'], 'edge')}, {length}, {ends}; there is no ground truth"
     shares = [f"{facts[f'f_score_{limit}mm_percent']:.1f} % at {limit} mm" for limit in (5, 10, 20)]
     corners = f"; {facts['corners_closed']} of {facts['corners']} corners closed" if facts.get("corners") else ""
     return f"F-score {', '.join(shares)}{corners}"

@@ -29,6 +29,7 @@ from taichi_edges.progress import Progress
 
 STAGE_KEYS = {"seconds", "peak_memory_mib", "fingerprint", "inputs", "outputs", "facts"}
 DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR)
+# What the result of any stage may depend on; a stage that uses another package names it.
 PACKAGES = ("taichi", "numpy", "scipy", "opencv-python-headless", "open3d", "open3d-cpu", "onnxruntime")
 
 
@@ -39,6 +40,7 @@ class Stage:
     sections: the keys of the scene its result depends on ('a.b' reaches into a section). reads: artefacts of earlier
     stages. writes: its own. outside: function of the Run that lists the input files it reads beyond those, and raises
     UserError where the scene names one that is not there. on_device: whether threads and arch matter to its result.
+    packages: those beyond PACKAGES whose version matters to it.
     """
 
     function: Callable
@@ -47,6 +49,7 @@ class Stage:
     writes: tuple
     outside: Callable = lambda run: []
     on_device: bool = False
+    packages: tuple = ()
 
 
 STAGES = {
@@ -83,7 +86,14 @@ STAGES = {
         ("metrics.json", "metrics.csv"),
         stages.truth_files,
     ),
-    "export": Stage(stages.export, (), ("edges.json", "views.npz"), ("overlays.png",), stages.picture_files),
+    "export": Stage(
+        stages.export,
+        (),
+        ("edges.json", "views.npz"),
+        ("overlays.png",),
+        stages.picture_files,
+        packages=("ezdxf",),
+    ),
 }
 
 
@@ -173,16 +183,17 @@ def _open_record(run):
         "arch": run.arch,
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
         "python": platform.python_version(),
-        "versions": _versions(),
+        "versions": _versions(tuple(package for stage in STAGES.values() for package in stage.packages)),
         "ran": [],
         "stages": {name: stage for name, stage in known if isinstance(stage, dict) and set(stage) >= STAGE_KEYS},
     }
 
 
 @functools.cache
-def _versions():
+def _versions(more=()):
+    """The versions of ourselves, of PACKAGES and of more, by name; without those that are not installed."""
     found = {"taichi_edges": taichi_edges.__version__}
-    for package in PACKAGES:
+    for package in (*PACKAGES, *more):
         with contextlib.suppress(PackageNotFoundError):
             found[package] = version(package)
     return found
@@ -205,7 +216,7 @@ def _inputs(run, stage):
     """What the stage depends on: its settings, the versions, and the digest of every file it reads."""
     files = {artefact: digest_file(run.path(artefact)) for artefact in stage.reads}
     files |= {_label(run, path): digest_file(path) for path in stage.outside(run) if path.exists()}
-    return {"settings": _settings(run, stage), "files": files, "versions": _versions()}
+    return {"settings": _settings(run, stage), "files": files, "versions": _versions(stage.packages)}
 
 
 def _label(run, path):

@@ -19,6 +19,7 @@ from taichi_edges.artefacts import replacing, write_json, write_text
 from taichi_edges.cameras import transform
 from taichi_edges.edge_set import read_edges, write_edges
 from taichi_edges.errors import UserError, did_you_mean
+from taichi_edges.findings import amount
 from taichi_edges.views import read_views, write_views
 from taichi_edges.wireframe import read_wireframe, write_wireframe
 
@@ -324,9 +325,12 @@ def refine(run):
     views = read_views(run.path("views.npz"))
     loose, about = read_wireframe(run.path("edges_fit.json"))
     loose = loose.transformed(views.similarity.to_unit, views.similarity.scale)
-    if not is_running(run.arch, run.threads):
+    if run.config.refine.enabled and len(loose) and not is_running(run.arch, run.threads):
         start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)
     wireframe, counts = refine_wireframe(loose, views, run.config.refine)
+    if len(loose) and not len(wireframe):
+        found = f"the images support none of the {amount(len(loose), 'edge')} that were fitted"
+        run.progress.warn(f"{found}; look at detection.png, or set refine.enabled: false to keep them")
     write_wireframe(run.path("edges.json"), _in_input_frame(wireframe, views), about)
     return {"edges": len(wireframe), "vertices": len(wireframe.vertices), **asdict(counts)}
 
@@ -339,16 +343,19 @@ def truth_path(run):
 
 
 def evaluate(run):
-    """`edges.json` and the ground truth -> `metrics.json` and `metrics.csv` (EMAP's protocol)."""
+    """`edges.json` -> `metrics.json` and `metrics.csv`: EMAP's protocol, corners, free ends; without a truth fewer.
+
+    Lengths are in the frame of the truth, in the unit cube where there is none.
+    """
     from taichi_edges.evaluation.ground_truth import read_ground_truth
     from taichi_edges.evaluation.metrics import evaluate as measure
+    from taichi_edges.evaluation.metrics import measure_alone
 
     edges, _ = read_edges(run.path("edges.json"))
-    path = truth_path(run)
+    views, path = read_views(run.path("views.npz")), truth_path(run)
     if path is None:
-        metrics = {"lines": len(edges.lines), "curves": len(edges.curves), "ground_truth": None}
+        metrics = {**measure_alone(edges.transformed(views.similarity.to_unit)), "ground_truth": None}
     else:
-        views = read_views(run.path("views.npz"))
         to_truth, from_truth = views.input_to_truth, np.linalg.inv(views.input_to_truth)
         truth = read_ground_truth(path, lambda points: views.similarity.to_unit(transform(from_truth, points)))
         into_frame = partial(transform, to_truth) if truth.own_frame else views.similarity.to_unit

@@ -1,6 +1,10 @@
 """DXF and STEP hold exactly the edges that were written: other readers than ours say so."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,8 +19,9 @@ from taichi_edges.exporters.palette import KIND_COLOURS
 from taichi_edges.exporters.step import connected_parts, encoded, prefix_for, write_step
 from taichi_edges.shapes import EllipticArc, Line, Spline
 from taichi_edges.synthetic.parts import PARTS
-from taichi_edges.wireframe import Edge, Evidence, Wireframe, read_wireframe
+from taichi_edges.wireframe import Edge, Evidence, Wireframe, read_wireframe, write_wireframe
 
+ROOT = Path(__file__).parent.parent
 EXACT = 1e-9  # of the edges' size: sixteen digits go through a few products and, in DXF, through degrees
 PLANES = {
     "upright": ([1, 0, 0], [0, 1, 0]),
@@ -199,6 +204,23 @@ def test_the_same_edges_give_the_same_bytes(tmp_path, write):
     assert ezdxf.options.write_fixed_meta_data_for_testing == before
 
 
+@pytest.mark.parametrize("suffix", [".dxf", ".step"])
+def test_the_same_edges_give_the_same_bytes_in_every_process(tmp_path, suffix):
+    """Python orders sets of strings by a random number of the process."""
+    source = write_wireframe(tmp_path / "edges.json", house(), {})
+    code = (
+        "import sys; from taichi_edges.exporters import EXPORTERS; from taichi_edges.wireframe import read_wireframe; "
+        f"[EXPORTERS[{suffix!r}](path, read_wireframe(sys.argv[1])[0]) for path in sys.argv[2:]]"
+    )
+    written = set()
+    for number in ("1", "4"):  # ezdxf's own order differs between these
+        path = tmp_path / f"{number}{suffix}"
+        environment = {**os.environ, "PYTHONHASHSEED": number}
+        subprocess.run([sys.executable, "-c", code, source, path], check=True, cwd=ROOT, env=environment)
+        written.add(path.read_bytes())
+    assert len(written) == 1
+
+
 # ----------------------------------------------------------------------------------------------------------------- STEP
 
 
@@ -244,7 +266,7 @@ def test_step_edges_share_their_vertices_and_are_named(tmp_path):
     assert sorted(meeting.count(vertex) for vertex in set(meeting)) == [1, 1, 1, 2, 2, 2, 2]
     assert edges[4].vertices == (edges[2].vertices[1], edges[0].vertices[0])
     assert edges[5].vertices[0] == edges[5].vertices[1]  # the circle's own
-    assert sets == connected_parts(house()) == [[0, 1, 2, 4], [3], [5]]
+    assert sets == connected_parts(house()) == [[0, 1, 2, 4], [3], [5]]  # edge 3 touches 0 between its ends
     names = [edge.name for edge in edges]
     assert names[:2] == [
         f"line_{i}, confidence 0.50, {w}, residual 0.21 px" for i, w in enumerate(("1 view", "2 views"))

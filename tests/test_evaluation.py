@@ -20,6 +20,7 @@ from taichi_edges.evaluation.metrics import (
     average_per_voxel,
     duplicated_percent,
     evaluate,
+    measure_alone,
     metrics_rows,
     sample_prediction,
 )
@@ -165,6 +166,14 @@ def test_counts_pieces_and_edges():
     metrics = evaluate(edges, truth_of(line([0, 0, 0], [1, 0, 0])))
     assert (metrics["lines"], metrics["curves"], metrics["edges"], metrics["true_edges"]) == (3, 4, 4, 1)
     assert metrics["predicted_length_units"] == pytest.approx(3 + 2 * np.pi * 0.2, rel=1e-3)
+
+
+def test_edges_measured_alone_are_measured_as_beside_a_truth():
+    lines, nothing = np.random.default_rng(0).uniform(size=(4, 2, 3)), np.zeros(0, int)
+    edges = EdgeSet(lines, np.zeros((0, 4, 3)), np.array([0, 1, 1, 2]), nothing)
+    beside = evaluate(edges, GroundTruth(np.zeros((1, 3)), (), (), None, "one point"))
+    alone = measure_alone(edges)
+    assert alone["edges"] == 3 and alone == {key: beside[key] for key in alone}
 
 
 def test_rows_are_labels_with_values_and_units():

@@ -376,7 +376,22 @@ def test_caption_counts_edges_and_what_is_drawn(edges, monkeypatch):
     said = []
     monkeypatch.setattr("taichi_edges.exporters.overlays._write", lambda strip, words, *_: said.append(words))
     caption(800, "a view", edges)
-    assert sorted(said) == ["a view", "curves 2", "free ends 2", "lines 2", "vertices 2"]
+    counts = ["curves 2", "free ends 2", "lines 2", "shared vertices 2"]
+    assert sorted(said) == sorted(["a view", *counts, "fainter: less certain"])
+    said.clear()
+    caption(800, "a view", lines_between([[0, 0, 0], [1, 1, 1]]))
+    assert sorted(said) == ["a view", "curves 0", "free ends 2", "lines 1", "shared vertices 0"]  # nothing is faint
+
+
+@pytest.mark.parametrize("width", [200, 400, 800, 3000])
+def test_caption_has_room_for_names_and_the_whole_legend(edges, monkeypatch, width):
+    def write_inside(strip, words, origin, scale):
+        (wide, high), below = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, scale, max(round(2 * scale), 1))
+        assert origin[0] >= 0 and origin[0] + wide <= width and origin[1] >= high and origin[1] + below <= len(strip)
+
+    monkeypatch.setattr("taichi_edges.exporters.overlays._write", write_inside)
+    long_name = "from_the_left_" * 20
+    assert caption(width, "v1", edges).shape == caption(width, long_name, edges).shape
 
 
 def test_overlay_places_strokes_to_a_fraction_of_a_pixel(tmp_path):
@@ -489,11 +504,9 @@ def test_viewer_without_a_display_says_what_to_open_instead(edges, rng, monkeypa
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     points = rng.normal(size=(5, 3))
-    with pytest.raises(UserError, match=r"no display .* open points\.ply, edges\.ply, .* instead") as caught:
-        show(points, points, edges)
+    with pytest.raises(UserError, match=r"no display .* open points\.ply, runs/nut/edges\.obj instead") as caught:
+        show(points, points, edges, ["points.ply", "runs/nut/edges.obj"])
     assert "\n" not in str(caught.value)
-    with pytest.raises(UserError, match=r"open runs/nut/edges\.obj instead"):
-        show(points, points, edges, written_files=["runs/nut/edges.obj"])
 
 
 @pytest.mark.parametrize("opened", [False, True])
@@ -512,8 +525,8 @@ def test_viewer_whose_window_cannot_be_made_says_so(edges, rng, monkeypatch, cap
     monkeypatch.setenv("DISPLAY", ":99")
     monkeypatch.setattr(o3d.visualization, "Visualizer", NoWindow)
     points = rng.normal(size=(5, 3))
-    with pytest.raises(UserError, match=r"cannot be reached or has no OpenGL; open points\.ply"):
-        show(points, points, edges)
+    with pytest.raises(UserError, match=r"cannot be reached or has no OpenGL; open points\.ply instead"):
+        show(points, points, edges, ["points.ply"])
     assert capsys.readouterr().out == ""
 
 

@@ -12,6 +12,8 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import asdict
+from importlib.metadata import version
 from pathlib import Path
 
 import cv2
@@ -22,7 +24,9 @@ from scipy.spatial import cKDTree
 
 from taichi_edges.artefacts import digest_file, remove_unfinished, replacing
 from taichi_edges.cameras import Similarity, invert_pose
+from taichi_edges.command import print_summary
 from taichi_edges.edge_set import EdgeSet, read_edges, write_edges
+from taichi_edges.edges.refinement import RefineCounts
 from taichi_edges.errors import UserError
 from taichi_edges.exporters.point_cloud import read_oriented_points
 from taichi_edges.exporters.splats import read_gaussians
@@ -218,6 +222,26 @@ def test_metrics_do_not_depend_on_the_units_of_the_input(tmp_path):
     assert metrics["true_length_units"] == pytest.approx(0.8)
 
 
+def test_without_a_truth_the_edges_are_measured_alone(tmp_path, capsys):
+    """In the unit cube, whatever the units of the input."""
+    similarity, pose = Similarity(1.0 / 800.0, (0.1, 0.2, 0.3)), np.eye(3, 4)[None]
+    views = Views(("v",), np.zeros((1, 4, 4), np.uint8), np.eye(3)[None], pose, ("",), similarity)
+    write_views(tmp_path / "views.npz", views)
+    lines = similarity.to_input([[[0.1, 0.2, 0.3], [0.9, 0.2, 0.3]], [[0.9, 0.2, 0.3], [0.9, 0.5, 0.3]]])
+    write_edges(tmp_path / "edges.json", EdgeSet.of(lines), {"units": "input"})
+    run = Run(check_scene({"source": {"reader": "nerf", "path": "unused"}}, "test"), tmp_path)
+    metrics = evaluate(run)
+    assert metrics["ground_truth"] is None and metrics["predicted_length_units"] == pytest.approx(1.1)
+    assert (metrics["lines"], metrics["curves"], metrics["edges"], metrics["free_ends"]) == (2, 0, 2, 2)
+    with open(tmp_path / "metrics.csv", newline="") as file:
+        assert ["free_ends", "2"] in list(csv.reader(file))
+    stages = {"prepare": {"facts": {"files": []}}, "evaluate": {"facts": metrics}}
+    for stage in stages.values():
+        stage |= {"seconds": 1.0, "peak_memory_mib": 1.0}
+    print_summary(run, {"stages": stages, "ran": []})
+    assert re.search(r"length +1\.10 units\n.*\n +free ends +2\n +ground truth +none\n", capsys.readouterr().out)
+
+
 def test_everything_exported_is_in_the_frame_of_the_input(finished, tmp_path):
     """The views of the finished run again, as a folder whose units are 2000 to the unit cube, centred at zero."""
     scene, runs, _ = finished
@@ -321,7 +345,11 @@ def test_every_stage_can_say_what_it_found():
     assert list(FINDINGS) == list(STAGES)
     fit = {"lines": 1, "curves": 2, "loop_clusters": 1, "short_clusters": 3, "degenerate_clusters": 0}
     assert FINDINGS["fit"](fit) == "1 line and 2 curves (1 closed edge); left out: 3 clusters that are too short"
-    assert "no ground truth" in FINDINGS["evaluate"]({"ground_truth": None})
+    alone = {"edges": 2, "predicted_length_units": 1.5, "free_ends": 1, "ground_truth": None}
+    assert FINDINGS["evaluate"](alone) == "2 edges, 1.50 units long, 1 free end; there is no ground truth"
+    refined = {"edges": 1, "vertices": 2, **asdict(RefineCounts(duplicates=1, unsupported=2))}
+    left_out = "left out: 1 duplicate, 2 edges without support in the images"
+    assert FINDINGS["refine"](refined) == f"1 edge, 2 vertices; {left_out}"
 
 
 # --------------------------------------------------------------------------------------- skipping and running again
@@ -368,6 +396,18 @@ def test_a_stage_whose_inputs_come_out_the_same_is_skipped(copied):
     )
 
 
+def test_another_version_of_a_package_makes_those_stages_stale_that_use_it(copied, monkeypatch):
+    """A new ezdxf writes another DXF; nothing is trained again for it."""
+    from taichi_edges import pipeline
+
+    monkeypatch.setattr(pipeline, "version", lambda name: "99.0" if name == "ezdxf" else version(name))
+    pipeline._versions.cache_clear()
+    record, said = rerun(copied)
+    pipeline._versions.cache_clear()
+    assert record["ran"] == ["export"] and record["versions"]["ezdxf"] == "99.0"
+    assert any("export again" in line and "the version of ezdxf was" in line for line in said.lines)
+
+
 def test_stage_starts_there_and_reuses_what_is_before(copied):
     _, _, folder = copied
     gaussians = (folder / "gaussians.ply").stat().st_mtime_ns
@@ -382,6 +422,23 @@ def test_stage_starts_there_and_reuses_what_is_before(copied):
 def test_until_stops_there(copied):
     record, said = rerun(copied, ["cluster.max_gap=0.08"], until="cluster")
     assert set(said.states()) == {"prepare", "train", "cluster"} and record["ran"] == ["cluster"]
+
+
+@pytest.mark.parametrize(
+    ("until", "results"),
+    [
+        ("prepare", ["detection.png"]),
+        ("cluster", ["detection.png"]),
+        ("fit", ["edges_fit.json", "detection.png"]),
+        ("refine", ["edges.json", "detection.png"]),
+        ("evaluate", ["edges.json", "detection.png"]),
+    ],
+)
+def test_summary_names_the_edges_as_far_as_they_have_come(copied, capsys, until, results):
+    scene, runs, folder = copied
+    record, _ = rerun(copied, until=until)
+    print_summary(Run(load_scene(scene), folder), record, until)
+    assert capsys.readouterr().out.splitlines()[-1] == f"results: {folder}/  ({', '.join(results)})"
 
 
 def test_stage_and_until_name_one_stage(copied):

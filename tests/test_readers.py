@@ -194,8 +194,10 @@ def test_emap_accepts_4x4_intrinsics(emap, block):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_any_box_is_brought_into_the_unit_cube_and_seen_in_the_same_pixels(kind, tmp_path, block):
-    scale, shift = 40.0, np.array([-7.0, 100.0, 3.0])
+@pytest.mark.parametrize("scale", [0.001, 40.0, 1000.0])
+def test_any_box_is_brought_into_the_unit_cube_and_seen_in_the_same_pixels(kind, scale, tmp_path, block):
+    """Cameras a few thousandths from the box are not too near where that is the size of the box."""
+    shift = scale * np.array([-0.2, 2.5, 0.1])
     folder = Folder(tmp_path / "big", kind, block, scale, shift)
     box = scale * np.array([[0.1, 0.0, 0.2], [0.9, 1.0, 0.7]]) + shift
     views = folder.read(box=box)
@@ -203,7 +205,7 @@ def test_any_box_is_brought_into_the_unit_cube_and_seen_in_the_same_pixels(kind,
     assert unit.min() >= -1e-12 and (unit[1] - unit[0]).max() == pytest.approx(1.0)
     np.testing.assert_allclose(views.box, unit)
     inputs = scale * POINTS + shift
-    np.testing.assert_allclose(views.similarity.to_input(views.similarity.to_unit(inputs)), inputs)
+    np.testing.assert_allclose(views.similarity.to_input(views.similarity.to_unit(inputs)), inputs, atol=1e-12 * scale)
     for view in range(VIEWS):
         expected, _ = project(POINTS, block[0][view], block[1][view])
         np.testing.assert_allclose(views.project(views.similarity.to_unit(inputs), view)[0], expected, atol=1e-6)

@@ -9,10 +9,14 @@ from edgel_scenes import views_of
 
 from taichi_edges.edges.model_selection import distances_to
 from taichi_edges.edges.refinement import RefineCounts, refine_wireframe
+from taichi_edges.pipeline import Run
+from taichi_edges.progress import Progress
 from taichi_edges.scene import RefineConfig
+from taichi_edges.scene_file import check_scene
 from taichi_edges.shapes import EllipticArc, Line, polyline
-from taichi_edges.views import pixel_size
-from taichi_edges.wireframe import Wireframe
+from taichi_edges.stages import refine
+from taichi_edges.views import pixel_size, write_views
+from taichi_edges.wireframe import Wireframe, read_wireframe, write_wireframe
 
 LOW, HIGH, RADIUS = np.array([0.3, 0.35, 0.4]), np.array([0.7, 0.65, 0.55]), 0.08
 ENABLED = RefineConfig(enabled=True)
@@ -146,3 +150,39 @@ def test_edges_in_views_that_show_nothing_are_none(taichi, generator):
     box = Box(generator)
     found, counts = refine_wireframe(Wireframe.loose(box.lines), views_of([], generator), ENABLED)
     assert len(found) == 0 and counts.unsupported == 12
+
+
+class Warnings(Progress):
+    """Keeps the warnings."""
+
+    def __init__(self):
+        self.texts = []
+
+    def warn(self, text):
+        self.texts.append(text)
+
+
+def run_of(folder, loose, views, **settings):
+    """A Run before its refine stage."""
+    write_views(folder / "views.npz", views)
+    write_wireframe(folder / "edges_fit.json", loose, {})
+    scene = check_scene({"source": {"reader": "synthetic", "part": "block"}, "refine": settings}, "test")
+    return Run(scene, folder, progress=Warnings())
+
+
+def test_stage_warns_when_no_edge_is_left(start_taichi, tmp_path, monkeypatch, generator):
+    monkeypatch.setattr("taichi_edges.kernels.device.start_taichi", lambda *_: start_taichi("f32", 1))
+    lines = [Line(np.array([[0.2, 0.3, 0.4], [0.7, 0.6, 0.5]]))] * 2
+    run = run_of(tmp_path, Wireframe.loose(lines), views_of([], generator, count=4), enabled=True)
+    assert refine(run)["edges"] == 0 and len(read_wireframe(tmp_path / "edges.json")[0]) == 0
+    (text,) = run.progress.texts
+    assert "the images support none of the 2 edges that were fitted" in text and "refine.enabled: false" in text
+
+
+@pytest.mark.parametrize(("enabled", "count"), [(False, 1), (True, 0)])
+def test_stage_without_work_waits_for_no_device_and_warns_of_nothing(tmp_path, monkeypatch, generator, enabled, count):
+    monkeypatch.setattr("taichi_edges.kernels.device.start_taichi", lambda *_: pytest.fail("Taichi was started"))
+    monkeypatch.setattr("taichi_edges.kernels.device.is_running", lambda *_: False)
+    loose = Wireframe.loose([Line(np.array([[0.2, 0.3, 0.4], [0.7, 0.6, 0.5]]))] * count)
+    run = run_of(tmp_path, loose, views_of([], generator, count=4), enabled=enabled)
+    assert refine(run)["edges"] == count and run.progress.texts == []

@@ -19,7 +19,7 @@ from taichi_edges.errors import UserError
 from taichi_edges.evaluation.dense_curves import STEP
 from taichi_edges.evaluation.duplicates import duplicated_percent
 from taichi_edges.evaluation.primitives import true_primitives
-from taichi_edges.evaluation.wireframe import wireframe
+from taichi_edges.evaluation.wireframe import free_ends, wireframe
 from taichi_edges.evaluation.wireframe_metrics import wireframe_metrics
 
 SAMPLE_SPACING = 0.005  # normalised units, EMAP sample_resolution
@@ -42,6 +42,20 @@ def evaluate(edges, truth):
     metrics = count_metrics(edges, truth, sources, true) | length_metrics(edges, truth, sources)
     metrics |= wireframe_metrics(wireframe(exact_polylines(edges), sources), true)
     return metrics | point_metrics(sample_prediction(edges), truth.points.astype(np.float32))
+
+
+def measure_alone(edges):
+    """What can be said of `edges`, an EdgeSet in the normalised frame, without a truth; the keys are `evaluate`'s."""
+    refuse_unbounded(edges)
+    sources = piece_sources(edges)
+    return {
+        "lines": len(edges.lines),
+        "curves": len(edges.curves),
+        "edges": len(np.unique(sources)),
+        "predicted_length_units": float(edges.lengths.sum()),
+        "duplicated_length_percent": duplicated_percent(edges.polylines(), sources),
+        "free_ends": len(free_ends(wireframe(exact_polylines(edges), sources))),
+    }
 
 
 def count_metrics(edges, truth, sources, true):
@@ -200,6 +214,19 @@ def metrics_rows(metrics):
         for label, key in (("precision", "precision"), ("recall", "recall"), ("F-score", "f_score")):
             rows.append((f"{label} at {threshold} mm", f"{metrics[f'{key}_{threshold}mm_percent']:.1f} %"))
     return rows
+
+
+def rows_alone(metrics):
+    """The dict of `measure_alone` as rows (label, value with unit) for printing."""
+    metrics = defaultdict(lambda: None, metrics)  # a run that an earlier version has measured lacks some
+    return [
+        ("lines, curves", f"{metrics['lines']}, {metrics['curves']}"),
+        ("edges", number_text(metrics["edges"], "{:d}")),
+        ("length", number_text(metrics["predicted_length_units"], "{:.2f} units")),
+        ("duplicated length", number_text(metrics["duplicated_length_percent"], "{:.1f} %")),
+        ("free ends", number_text(metrics["free_ends"], "{:d}")),
+        ("ground truth", "none"),
+    ]
 
 
 def number_text(value, pattern="{:.2f}"):

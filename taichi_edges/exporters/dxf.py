@@ -32,6 +32,7 @@ def write_dxf(path, wireframe):
             entity.dxf.layer = layer_of(edge.shape.kind)
             entity.set_xdata(APPLICATION, _extended_data(number, edge))
         _look_at(document, wireframe)
+        _declare_classes(document)
         document.saveas(unfinished)
     return path
 
@@ -52,6 +53,12 @@ def _fixed_dates():
         yield ezdxf
     finally:
         ezdxf.options.write_fixed_meta_data_for_testing = before
+
+
+def _declare_classes(document):
+    """By the alphabet; ezdxf itself takes the order of a set, which differs from process to process."""
+    for name in sorted(document.entitydb.dxf_types_in_use()):
+        document.classes.add_class(name)
 
 
 def _extended_data(number, edge):

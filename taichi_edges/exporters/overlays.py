@@ -177,49 +177,71 @@ def clip_segments(segments, planes):
 
 
 def caption(width, name, wireframe):
-    """The strip below the picture, (h, width, 3) uint8 BGR: the view's name on the left, the legend on the right.
+    """The strip below the picture, (h, width, 3) uint8 BGR: the view's name, below it the legend.
 
-    Edges are counted, not their pieces; vertices where edges meet, and free ends, as they are drawn.
+    Edges are counted, not their pieces; vertices where edges meet, and free ends, as they are drawn. The height is the
+    same for every name: a long one is written in smaller letters.
     """
     scale = max(0.5 * width / REFERENCE_WIDTH, 0.4)
-    thickness = max(round(2 * scale), 1)
-    letter = cv2.getTextSize("0", cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)[0]
-    strip = np.full((3 * letter[1], width, 3), 245, np.uint8)
-    baseline, right = 2 * letter[1], width - letter[0]
-    for symbol, words in reversed(_legend(wireframe)):
-        right -= cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)[0][0]
-        _write(strip, words, (right, baseline), scale)
-        right -= 3 * letter[0]
-        middle = baseline - letter[1] / 2
-        symbol(strip, np.array([[right, middle], [right + 2 * letter[0], middle]]), 2.0 * thickness)
-        right -= 2 * letter[0]
-    fitting = max((right - letter[0]) // letter[0], 0)
-    _write(strip, name[:fitting], (letter[0], baseline), scale)
+    letter, line = _size_of("0", scale)
+    rows = _rows(_legend(wireframe), width - letter, letter, scale)
+    strip = np.full(((2 * len(rows) + 3) * line, width, 3), 245, np.uint8)
+    smaller = min(1.0, (width - 2 * letter) / max(_size_of(name, scale)[0], 1))
+    _write(strip, name, (letter, 2 * line), scale * smaller)
+    for row, placed in enumerate(rows):
+        baseline = 2 * (row + 2) * line
+        for left, symbol, words in placed:
+            middle = baseline - line / 2
+            symbol(strip, np.array([[left, middle], [left + 2 * letter, middle]]), 2.0 * _thickness(scale))
+            _write(strip, words, (left + 3 * letter, baseline), scale)
     return strip
+
+
+def _rows(legend, right, letter, scale):
+    """The legend in as many rows as it needs, which end before the pixel `right`: lists of (left, symbol, words)."""
+    rows, left = [], right
+    for symbol, words in legend:
+        size = 3 * letter + _size_of(words, scale)[0]
+        if left + size > right:
+            rows.append([])
+            left = letter
+        rows[-1].append((left, symbol, words))
+        left += size + 2 * letter
+    return rows
 
 
 def _legend(wireframe):
     """What is drawn in the overlays, as (function that draws a sample between two pixels (2, 2), words)."""
     lines, degrees = int(_are_lines(wireframe).sum()), wireframe.degrees
 
-    def stretch(colour):
-        return lambda strip, ends, stroke: _paint(strip, colour, stroke, [(1.0, ends[None])])
+    def stretch(colour, opacity=1.0):
+        return lambda strip, ends, stroke: _paint(strip, colour, stroke, [(opacity, ends[None])])
 
     def mark(ring):
         return lambda strip, ends, stroke: _mark(strip, ends.mean(axis=0)[None], stroke, ring)
 
-    return [
+    legend = [
         (stretch(LINE_COLOUR), f"lines {lines}"),
         (stretch(CURVE_COLOUR), f"curves {len(wireframe) - lines}"),
-        (mark(ring=False), f"vertices {(degrees > 1).sum()}"),
+        (mark(ring=False), f"shared vertices {(degrees > 1).sum()}"),
         (mark(ring=True), f"free ends {(degrees == 1).sum()}"),
     ]
+    faint = (stretch(LINE_COLOUR, FAINTEST), "fainter: less certain")
+    return [*legend, faint] if (_opacities(wireframe) < 1.0).any() else legend
+
+
+def _size_of(words, scale):
+    """(width, height above the baseline) of letters, px."""
+    return cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, scale, _thickness(scale))[0]
+
+
+def _thickness(scale):
+    return max(round(2 * scale), 1)
 
 
 def _write(picture, words, origin, scale):
     """Letters with their lower left corner at `origin`, (x, y) pixels."""
-    thickness = max(round(2 * scale), 1)
-    cv2.putText(picture, words, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, TEXT_COLOUR, thickness, cv2.LINE_AA)
+    cv2.putText(picture, words, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, TEXT_COLOUR, _thickness(scale), cv2.LINE_AA)
 
 
 def _paint(picture, colour, stroke, layers):

@@ -1,10 +1,12 @@
 """STEP for CAD programs: a wireframe of exact lines, circles, ellipses and B-splines that share their vertices.
 
 ISO 10303-21 text of the schema of AP214, an edge-based wireframe (ISO 10303-501): each edge is an EDGE_CURVE between
-VERTEX_POINTs, those that meet are a CONNECTED_EDGE_SET. Its name is the kind, the index in `edges.json` and what the
-images say of it. The numbers are those of the input's frame. It has no unit, but STEP cannot do without, and to kernels
-it matters: OpenCASCADE, for one, heals gaps of up to 1 mm, and so merges the corners of an object of that size. So they
-are metres, or whatever makes the object between a tenth of a metre and a hundred metres large.
+VERTEX_POINTs, and edges that hang together by shared vertices are a CONNECTED_EDGE_SET. A T-junction joins none: edges
+of this format meet in their vertices only, and to cut the through edge there would make two of one. The name of an edge
+is its kind, its index in `edges.json` and what the images say of it. The numbers are those of the input's frame. It has
+no unit, but STEP cannot do without, and to kernels it matters: OpenCASCADE, for one, heals gaps of up to 1 mm, and so
+merges the corners of an object of that size. So they are metres, or whatever makes the object between a tenth of a
+metre and a hundred metres large.
 """
 
 import math
@@ -91,7 +93,7 @@ def write_step(path, wireframe):
 
 
 def connected_parts(wireframe):
-    """The edges that hang together, as lists of their indices, by the first."""
+    """The edges that hang together by shared vertices, as lists of their indices, by the first."""
     first_at, parts = {}, [[number] for number in range(len(wireframe))]
     for number, edge in enumerate(wireframe.edges):
         for vertex in edge.vertices:

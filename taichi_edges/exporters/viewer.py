@@ -15,7 +15,6 @@ DIRECTION_COLOUR = (0.78, 0.78, 0.78)  # pale, so that the edges stand out
 DIRECTION_LENGTH = 0.01  # of the diagonal of the points' box
 VIEW_FROM = (0.6, -0.8, 0.5)  # obliquely from above, for scenes whose z points up
 VIEW_ZOOM = 1.0  # Open3D's own 0.7 cuts off the corners of a cube seen obliquely
-WRITTEN_FILES = ("points.ply", "edges.ply", "edges.step", "overlays/")
 
 
 def build_geometries(points, directions, wireframe):
@@ -42,7 +41,7 @@ def build_geometries(points, directions, wireframe):
     return geometries
 
 
-def show(points, directions, wireframe, written_files=WRITTEN_FILES):
+def show(points, directions, wireframe, written_files):
     """Open a window and return when it is closed.
 
     points, directions, wireframe: as in `build_geometries`. written_files: what to open instead where there is no

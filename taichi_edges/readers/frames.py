@@ -241,8 +241,12 @@ def _check_box_seen(frames, intrinsics, poses, box, size, opengl):
 
 
 def _views_that_see(box, intrinsics, world_to_camera, size):
-    """(V,) bool: which views have at least one point of a grid through the (2, 3) box inside the image."""
-    axes = [np.linspace(low, high, BOX_GRID) for low, high in zip(*box, strict=True)]
+    """(V,) bool: which views have at least one point of a grid through the (2, 3) box inside the image.
+
+    In the unit cube, as all that follows: what is too near for a camera does not depend on the units of the input.
+    """
+    similarity = Similarity.of_box(box)
+    axes = [np.linspace(low, high, BOX_GRID) for low, high in zip(*similarity.to_unit(box), strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    cameras = zip(intrinsics, world_to_camera, strict=True)
+    cameras = zip(intrinsics, into_unit_cube(world_to_camera, similarity), strict=True)
     return np.array([inside_image(project(grid, lens, pose)[0], *size).any() for lens, pose in cameras])
