@@ -225,7 +225,7 @@ def cut_anew(parts, tracks, yardstick, pixel, seen):
     least, choice = [0.0], []
     for last, shape in enumerate(parts):
         best = (least[last] + price_of(shape) * np.log(count), last, shape)
-        for first in range(last, max(0, last - LONGEST_RUN + 1) - 1, -1):
+        for first in range(last - 1, max(0, last - LONGEST_RUN + 1) - 1, -1):
             run = tracks[first : last + 1]
             worth = (best[0] - least[first]) * (1 - ROUNDING)
             shape, cost = best_shape(joined_track(run), yardstick, count, worth)
