@@ -35,7 +35,7 @@ from taichi_edges.synthetic.rendering import (
 from taichi_edges.synthetic.visibility import ray_scene, sample_contours, sample_edges, visible_from
 from taichi_edges.views import Views
 
-SIZE, VIEWS, FINE = 260, 12, 3  # px, views, rays along each side of a pixel of the alpha channel
+SIZE, VIEWS, FINE = 260, 14, 3  # px, views, rays along each side of a pixel of the alpha channel
 SHIFT, OFFSET = (-0.5, 0.7), 1.2  # px, planted
 SEED_NOISE = 1.0  # px, standard deviation of the seeds across the true edges
 UNKNOWN = np.full(3, np.nan)
@@ -153,7 +153,7 @@ def test_planted_shift_and_offset_are_found_and_corrected(part, generator, image
     assert np.median(true_errors(part, edgels)) > 0.5
     assert np.median(true_errors(part, corrected)) < 0.1
     assert np.nanmedian(np.abs(found.residuals)) < 0.1
-    assert np.isfinite(found.residuals).mean() > 0.45  # points that few of the twelve views see explain nothing
+    assert np.isfinite(found.residuals).mean() > 0.5  # points that few of the views see explain nothing
 
 
 def test_with_images_the_rims_of_through_holes_are_corrected_too(part, generator):

@@ -345,5 +345,5 @@ def test_continued_edges_stay_as_they_are(generator):
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_hardly_anything_to_continue(generator, count):
-    strokes = [any_shape("arc", generator)] * count
+    strokes = [any_shape("spline", generator)] * count
     assert continued(strokes, YARDSTICK, PIXEL, everywhere) == (strokes, Merging())

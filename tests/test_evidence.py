@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from edgel_scenes import CylinderContour, arc, line, pixel_of, views_of
 
-from taichi_edges.edges.evidence import Claims, Samples, claims_of, spaced, support_along, support_of, supported
+from taichi_edges.edges.evidence import Claims, Samples, claims_of, evidence_of, spaced, support_along, support_of
 from taichi_edges.kernels.edgel_matching import EdgelMatching
 from taichi_edges.shapes import EllipticArc, Line, Spline
 
@@ -22,6 +22,11 @@ def taichi(start_taichi):
 def matching_of(curves, generator, **settings):
     """EdgelMatching of views of curves."""
     return EdgelMatching(views_of(curves, generator, **settings))
+
+
+def supported(matching, shapes):
+    """The Evidence of each shape."""
+    return evidence_of(support_of(matching, shapes))
 
 
 def moved(shape, offset):

@@ -90,9 +90,8 @@ def test_images_alone_are_enough(prepare, tmp_path, rendered):
     for view in range(VIEWS):  # where the true maps have lines, to a pixel
         near = cv2.dilate((truth.edge_maps[view] >= 128).astype(np.uint8), np.ones((3, 3)))
         places = np.rint(views.edgels.of_view(view)[0]).astype(int)
-        assert (
-            near[places[:, 1], places[:, 0]].mean() > 0.85
-        )  # steps of rounding in smooth shading look like faint edges
+        # Steps of rounding in smooth shading look like faint edges.
+        assert near[places[:, 1], places[:, 0]].mean() > 0.85
         assert (views.edge_maps[view] >= 128).any()
 
 

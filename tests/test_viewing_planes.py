@@ -230,7 +230,7 @@ def test_half_an_edge_grows_to_its_ends_and_not_beyond(taichi, generator):
 
 
 def test_growing_asks_for_the_support_it_is_told(taichi, generator):
-    views = views_of([A], generator, hidden=0.7)
+    views = views_of([A], generator, hidden=0.6)
     matching = EdgelMatching(views)
     start = refine_points(matching, A(np.linspace(0.4, 0.6, 30)), tangents(A, np.linspace(0.4, 0.6, 30)))
     assert len(grow_points(matching, start, np.full(30, 0.9))) == len(start)

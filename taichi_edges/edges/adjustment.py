@@ -142,7 +142,7 @@ class Problem:
 
 
 def adjusted(wireframe, matching, relations=(), radii=RADII_PX):
-    """The Wireframe whose edges agree best with the edgels of all views, without evidence (see `evidence.supported`).
+    """The Wireframe whose edges agree best with the edgels of all views, without evidence (see `evidence.evidence_of`).
 
     matching: EdgelMatching. relations: Constraints. radii: px, one for each round.
     """

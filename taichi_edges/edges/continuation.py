@@ -84,11 +84,11 @@ def with_whole_circles(shapes, yardstick, pixel, seen):
         others = sorted(set(others) & set(near.tolist()))
         on = {n: on_shape(circle, tracks[n], yardstick) for n in others}
         parts = [n for n in others if on[n].mean() >= REPEATED]
-        places = np.concatenate([tracks[n].points[on[n]] for n in others])
-        if number in parts and goes_on(circle, places, pixel, seen, COVERED):
-            if is_cheaper(circle, [shapes[n] for n in parts], [tracks[n] for n in parts], yardstick):
-                circles.append(circle)
-                gone.update(parts)
+        if number not in parts or not is_cheaper(circle, parts, shapes, tracks, yardstick):
+            continue
+        if goes_on(circle, np.concatenate([tracks[n].points[on[n]] for n in others]), pixel, seen, COVERED):
+            circles.append(circle)
+            gone.update(parts)
     return [shape for n, shape in enumerate(shapes) if n not in gone] + circles, len(circles)
 
 
@@ -127,11 +127,11 @@ def goes_on(shape, places, pixel, seen, least=0.0):
     return (views[~covered] >= max(GAP_SEEN * usual, LEAST_GAP_VIEWS)).mean() >= GAP_SHOWN
 
 
-def is_cheaper(shape, parts, tracks, yardstick):
-    """Does the shape describe what its parts describe at less cost (BIC)?"""
-    points, share = (np.concatenate([getattr(track, name) for track in tracks]) for name in ("points", "share"))
+def is_cheaper(shape, parts, shapes, tracks, yardstick):
+    """Does a shape describe what its parts, indices of shapes, describe at less cost (BIC)? tracks: of all shapes."""
+    points, share = (np.concatenate([getattr(tracks[n], name) for n in parts]) for name in ("points", "share"))
     price = np.log(observations(share, yardstick))
-    before = price * sum(price_of(part) for part in parts)
+    before = price * sum(price_of(shapes[n]) for n in parts)
     return price * price_of(shape) + misfit(distances_to(shape, points), share, yardstick) < before
 
 

@@ -194,13 +194,8 @@ def _owned(matching, samples, edgels, residuals, handicaps):
     return Support(samples, edgels, residuals, weights, claims, chance_weight(matching))
 
 
-def supported(matching, shapes):
-    """One Evidence for each shape: what the views say for and against it when every edgel supports one edge alone."""
-    return evidence_of(support_of(matching, shapes))
-
-
 def evidence_of(support):
-    """One Evidence for each edge of a Support.
+    """One Evidence for each edge of a Support: what the views say when every edgel supports one edge alone.
 
     `confidence` is the share of the length that is not there by chance (`Support.certainty`), times how well its edgels
     lie on it: 1 as far as the noise explains their distances, their mean square over that beyond.

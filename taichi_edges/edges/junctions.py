@@ -136,11 +136,7 @@ def grouped(ends, reaches, found, pixel):
             continue
         for end in both:
             group_of[end] = both
-    groups = []
-    for end in range(len(ends)):
-        if not any(group_of[end] is group for group in groups):
-            groups.append(group_of[end])
-    return groups
+    return list({id(group): group for group in group_of.values()}.values())
 
 
 def agree(reaches, group, pixel):
@@ -247,9 +243,7 @@ def ellipse_between(shape, ends):
 
 
 def spline_between(shape, ends, pixel):
-    """A chain of as many cubics from one point to another, along the chain."""
-    if shape.closed:
-        return shape
+    """An open chain of as many cubics from one point to another, along the chain."""
     track = track_of(shape, pixel)
     heading = np.array([shape.tangents(0.0), shape.tangents(1.0)])
     beyond = ((ends - shape.ends) * heading).sum(axis=1)  # by how much the chain grows at its end, shrinks at its start

@@ -165,6 +165,26 @@ def is_inside(pixel, height, width):
     return pixel[0] >= -0.5 and pixel[1] >= -0.5 and pixel[0] < width - 0.5 and pixel[1] < height - 0.5
 
 
+@ti.func
+def add_plane(i, row, pixel, slopes, planes: ti.template(), strength, scale, equations: ti.template()):
+    """Adds the viewing plane of an edgel, u, v and normal in `row` of `planes`, to equations[i], see `add_equations`.
+
+    pixel, slopes: of the point, see `project_line`. strength: of the edgel.
+    """
+    normal = ti.Vector([planes[row, 2], planes[row, 3]])
+    residual = normal.dot(pixel - ti.Vector([planes[row, 0], planes[row, 1]]))
+    slope = normal @ slopes
+    weight = strength / (1.0 + (residual / scale) ** 2) ** 2
+    k = 0
+    for a in ti.static(range(3)):
+        for b in ti.static(range(a, 3)):
+            equations[i, k] = equations[i, k] + weight * slope[a] * slope[b]  # += would be atomic
+            k += 1
+    for a in ti.static(range(3)):
+        equations[i, 6 + a] = equations[i, 6 + a] + weight * residual * slope[a]
+    equations[i, 9] = equations[i, 9] + weight
+
+
 @ti.kernel
 def add_equations(
     size: ti.i32,
@@ -201,19 +221,7 @@ def add_equations(
                     equations[i, 10] = equations[i, 10] + 1.0  # += would be atomic
                     element = nearest_edgel(view, pixel, along, radius, most_sine, rows, columns, starts, elements)
                     if element >= 0:
-                        normal = ti.Vector([elements[element, 2], elements[element, 3]])
-                        edgel = ti.Vector([elements[element, 0], elements[element, 1]])
-                        residual = normal.dot(pixel - edgel)
-                        slope = normal @ slopes
-                        weight = strengths[element] / (1.0 + (residual / scale) ** 2) ** 2
-                        k = 0
-                        for a in ti.static(range(3)):
-                            for b in ti.static(range(a, 3)):
-                                equations[i, k] = equations[i, k] + weight * slope[a] * slope[b]
-                                k += 1
-                        for a in ti.static(range(3)):
-                            equations[i, 6 + a] = equations[i, 6 + a] + weight * residual * slope[a]
-                        equations[i, 9] = equations[i, 9] + weight
+                        add_plane(i, element, pixel, slopes, elements, strengths[element], scale, equations)
 
 
 @ti.kernel
@@ -270,15 +278,4 @@ def add_equations_of(
                 edgel = edgels[i, view]
                 if edgel >= 0:
                     pixel, slopes, _, _ = project_line(camera, load_point(points, i), ti.Vector([1.0, 0.0, 0.0]))
-                    normal = ti.Vector([planes[edgel, 2], planes[edgel, 3]])
-                    residual = normal.dot(pixel - ti.Vector([planes[edgel, 0], planes[edgel, 1]]))
-                    slope = normal @ slopes
-                    weight = planes[edgel, 4] / (1.0 + (residual / scale) ** 2) ** 2
-                    k = 0
-                    for a in ti.static(range(3)):
-                        for b in ti.static(range(a, 3)):
-                            equations[i, k] = equations[i, k] + weight * slope[a] * slope[b]
-                            k += 1
-                    for a in ti.static(range(3)):
-                        equations[i, 6 + a] = equations[i, 6 + a] + weight * residual * slope[a]
-                    equations[i, 9] = equations[i, 9] + weight
+                    add_plane(i, edgel, pixel, slopes, planes, planes[edgel, 4], scale, equations)
