@@ -36,7 +36,7 @@ class OnnxConfig(Section):
 class SourceConfig(Section):
     """Where edge maps and cameras come from."""
 
-    reader: Literal["nerf", "emap", "synthetic"] = Field("emap", description="layout of the folder, see README")
+    reader: Literal["nerf", "emap", "colmap", "idr", "synthetic"] = Field("emap", description="layout of the folder, see README")
     path: str = Field("", description="folder, relative to the data root (--data or TAICHI_EDGES_DATA) or absolute")
     edges: str = Field("", description="folder of ready edge maps inside `path`, e.g. edge_DexiNed")
     images: str = Field("", description="folder of the colour images inside `path`; '': where the layout has them")

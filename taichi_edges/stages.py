@@ -37,11 +37,26 @@ def prepare(run):
 
     source = run.config.source
     frames = chosen_frames(READERS[source.reader](run.data_path(source.path, "source.path"), source), source.skip)
+    if any(frames.lenses):
+        from taichi_edges.readers.undistortion import undistorted_frames
+
+        frames = undistorted_frames(frames, run.path("undistorted"))
     camera_poses(frames)  # a mistake in them shall not wait for the detector
     detector = choose_detector(source, frames)
     _refuse_needless_calibration(run, detector)
     frames, edge_maps, edgels = DETECTORS[detector](frames, run)
-    views = build_views(frames, edge_maps, edgels, source, run.config.box, run.progress)
+    box = run.config.box if frames.box is None else frames.box
+    if any(frames.mask_paths):
+        from taichi_edges.detectors.drawing import draw_edge_maps
+        from taichi_edges.detectors.masks import within_masks
+        from taichi_edges.detectors.ridges import trace_ridges
+
+        height, width = edge_maps.shape[1:]
+        if edgels is None:
+            edgels = trace_ridges(edge_maps, 4.0, source.thin_threshold, run.threads)
+        edgels = within_masks(edgels, frames.mask_paths, (width, height))
+        edge_maps = draw_edge_maps(edgels, height, width, run.threads)
+    views = build_views(frames, edge_maps, edgels, source, box, run.progress)
     return {"detector": detector, **_finish_views(run, views)}
 
 

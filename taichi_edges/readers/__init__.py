@@ -1,6 +1,8 @@
 """From a folder on disk to Views. One small module for each layout, one place (`frames`) for all the checks."""
 
+from taichi_edges.readers.colmap import read_colmap
 from taichi_edges.readers.emap import read_emap
+from taichi_edges.readers.idr import read_idr
 from taichi_edges.readers.nerf import read_nerf
 
-READERS = {"emap": read_emap, "nerf": read_nerf}
+READERS = {"colmap": read_colmap, "emap": read_emap, "idr": read_idr, "nerf": read_nerf}

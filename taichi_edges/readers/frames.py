@@ -1,7 +1,7 @@
 """Frames: what a reader found on disk, before anything is decoded; and how frames become Views, with every check."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from taichi_edges.views import Views
 ORTHONORMAL_TOLERANCE = 1e-3  # largest deviation of R^T R from the identity; files store six digits or more
 BOX_GRID = 9  # points along each side of the scene box that are looked for in every view
 OFF_CENTRE = 0.25  # of the image's size: a principal point farther from the centre is worth a warning
+PER_VIEW = ("names", "edge_paths", "image_paths", "intrinsics", "camera_to_world", "mask_paths", "lenses")
 LEAVE_OUT = "or leave such views out with source.skip"
 TAIL_BYTES = 64  # some writers pad the file behind its end marker
 # What a whole file ends with; a decoder alone may fill the missing rows of a truncated file with grey.
@@ -38,6 +39,15 @@ class Frames:
     opengl: bool
     size: tuple | None = None
     input_to_truth: np.ndarray = field(default_factory=lambda: np.eye(4))
+    mask_paths: list = ()
+    lenses: list = ()
+    points: np.ndarray | None = None
+    box: np.ndarray | None = None
+
+    def __post_init__(self):
+        for key in ("mask_paths", "lenses"):
+            if not getattr(self, key):
+                object.__setattr__(self, key, [None if key == "lenses" else ""] * len(self.names))
 
 
 def read_json(path, what):
@@ -130,11 +140,8 @@ def chosen_frames(frames, skip):
 
 def subset(frames, keep):
     """Some of the frames, by their indices."""
-    lists = ("names", "edge_paths", "image_paths", "intrinsics", "camera_to_world")
-    chosen = {key: [getattr(frames, key)[i] for i in keep] for key in lists}
-    return Frames(
-        frames.where, *chosen.values(), opengl=frames.opengl, size=frames.size, input_to_truth=frames.input_to_truth
-    )
+    chosen = {key: [getattr(frames, key)[i] for i in keep] for key in PER_VIEW if getattr(frames, key)}
+    return replace(frames, **chosen)
 
 
 def _check_names(frames):
