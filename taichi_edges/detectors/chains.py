@@ -1,0 +1,41 @@
+"""Chains of edgels: what is connected in a view, and how long it is. Texture is short; edges are long."""
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+LINK_PX = 1.6  # between edgels beside each other on a chain; they are about 1 px apart
+LINK_COSINE = np.cos(np.radians(25.0))  # between their normals
+BESIDE_PX = 0.7  # by which the next edgel may be off the line of the one before
+
+
+def chain_labels(edgels):
+    """(e,) int: the chain of each edgel; chains are numbered over all views."""
+    counts, labels = 0, []
+    for view in range(edgels.view_count):
+        points, normals, _ = edgels.of_view(view)
+        found, some = _chains_of(points, normals)
+        labels.append(some + counts)
+        counts += found
+    return np.concatenate([np.zeros(0, np.int64), *labels])
+
+
+def _chains_of(points, normals):
+    """Number of chains in one view, and the chain of each edgel."""
+    if not len(points):
+        return 0, np.zeros(0, np.int64)
+    pairs = cKDTree(points).query_pairs(LINK_PX, output_type="ndarray")
+    one, other = pairs.T
+    aligned = np.abs((normals[one] * normals[other]).sum(axis=1)) >= LINK_COSINE
+    apart = points[other] - points[one]
+    beside = np.minimum(np.abs((apart * normals[one]).sum(axis=1)), np.abs((apart * normals[other]).sum(axis=1)))
+    linked = aligned & (beside <= BESIDE_PX)
+    graph = coo_matrix((np.ones(linked.sum(), bool), (one[linked], other[linked])), (len(points), len(points)))
+    return connected_components(graph, directed=False)
+
+
+def chain_lengths(edgels):
+    """(e,) number of edgels on the chain of each edgel: its length in pixels, roughly."""
+    labels = chain_labels(edgels)
+    return np.bincount(labels)[labels] if len(labels) else np.zeros(0, np.int64)

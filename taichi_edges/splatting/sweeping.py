@@ -1,0 +1,252 @@
+"""Seeds by sweeping: along the viewing ray of an edgel, the depths at which other views see an edge of one direction.
+
+Where views are many and edges few, places where many views show any edge are edges (`voting`). In photographs of a
+building a tenth of all pixels lies beside an edgel, a place is in sight of a few views, and such places are everywhere.
+What tells them apart is the direction: the edgel and that of another view each span a plane with their camera, the
+planes meet in a line, and that line must be the same for the other views (Fabbri and Kimia, "3D Curve Sketch", 2010).
+And edges are long: the places that the edgels of one edge find lie along a line, those found by chance do not.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+from scipy.spatial import cKDTree
+
+from taichi_edges.cameras import NEAR, inside_image, project
+from taichi_edges.kernels.device import download, upload
+from taichi_edges.kernels.points import F32_1D, F32_2D, I32_1D, I32_2D, U8_3D
+from taichi_edges.views import pixel_size
+
+EVERY_PX = 8  # one edgel in each cell of this size is a reference
+LEAST_CHAIN = 20  # edgels; on shorter chains none is
+MOST_NEIGHBORS = 6  # views that a reference is compared with
+LEAST_ANGLE, MOST_ANGLE = np.radians(1.5), np.radians(50.0)  # between the rays of a reference and of its neighbours
+GRID = 12  # points along each side of the box that tell which views see the same
+STEP_PX = 1.5  # by which a place moves at most, in the neighbour with the longest baseline
+BINS = 12  # of directions in the viewing plane of the reference, 15 degrees each
+CODES = 254  # directions of edgels in a byte; 0 stands for no edgel
+NEAREST = 0.02  # unit cube: of a place to the reference's camera
+LEAST_SINE = 0.03  # of the angle between viewing planes; others have no line in common that could be compared
+CANDIDATES = 4  # depths kept for each reference
+TOGETHER = 3  # neighbours that must agree
+
+
+@dataclass(frozen=True)
+class SweepSeeds:
+    """points, directions: (n, 3) unit cube. views: (n,) that agree, the reference included. companions: (n,) how many
+    other candidates lie on the same line nearby. pixel: (n,) size of a pixel at each point, unit-cube units."""
+
+    points: np.ndarray
+    directions: np.ndarray
+    views: np.ndarray
+    companions: np.ndarray
+    pixel: np.ndarray
+
+
+@ti.kernel
+def stamp_directions(starts: I32_1D, elements: F32_2D, nearest: U8_3D, codes: U8_3D):
+    """In every pixel within a pixel of an edgel the code of the nearest one's direction. elements: u, v, code."""
+    for view in range(codes.shape[0]):
+        for e in range(starts[view], starts[view + 1]):
+            column, row = ti.cast(ti.round(elements[e, 0]), ti.i32), ti.cast(ti.round(elements[e, 1]), ti.i32)
+            for down in range(-1, 2):
+                for right in range(-1, 2):
+                    y, x = row + down, column + right
+                    if y >= 0 and x >= 0 and y < codes.shape[1] and x < codes.shape[2]:
+                        du, dv = elements[e, 0] - x, elements[e, 1] - y
+                        distance = ti.cast(ti.min(255.0, 100.0 * ti.sqrt(du * du + dv * dv)), ti.u8)
+                        if distance < nearest[view, y, x]:
+                            nearest[view, y, x] = distance
+                            codes[view, y, x] = ti.cast(elements[e, 2], ti.u8)
+
+
+@ti.kernel
+def sweep_rays(
+    rays: F32_2D,
+    normals: F32_2D,
+    ranges: F32_2D,
+    step: ti.f32,
+    epipoles: F32_2D,
+    cameras: F32_2D,
+    neighbors: I32_1D,
+    codes: U8_3D,
+    cosines: F32_1D,
+    sines: F32_1D,
+    needed: ti.i32,
+    found: I32_2D,
+    counts: I32_2D,
+):
+    """For each reference the depths at which most neighbours agree on a direction.
+
+    rays: (n, 3) directions, depth 1. normals: (n, 3) of the viewing planes. ranges: (n, 2) inverse depths. epipoles:
+    (m, 3) projections of the reference's centre; cameras (m, 9) the 3x3 parts of theirs. found: (n, CANDIDATES) step
+    times BINS plus bin; counts: neighbours that agree.
+    """
+    for i in range(rays.shape[0]):
+        ray = ti.Vector([rays[i, 0], rays[i, 1], rays[i, 2]])
+        normal = ti.Vector([normals[i, 0], normals[i, 1], normals[i, 2]])
+        e1 = ray.normalized()
+        e2 = normal.cross(e1)
+        steps = ti.cast((ranges[i, 1] - ranges[i, 0]) / step, ti.i32) + 1
+        last, slot = -10, 0
+        for k in range(steps):
+            inverse = ranges[i, 0] + k * step
+            tally, agreeing = ti.u64(0), 0
+            for m in range(neighbors.shape[0]):
+                h = ti.Vector([0.0, 0.0, 0.0])
+                for a in ti.static(range(3)):
+                    h[a] = inverse * epipoles[m, a]
+                    for b in ti.static(range(3)):
+                        h[a] += cameras[m, 3 * a + b] * ray[b]
+                if h[2] > NEAR * inverse:
+                    u, v = h[0] / h[2], h[1] / h[2]
+                    column, row = ti.cast(ti.floor(u + 0.5), ti.i32), ti.cast(ti.floor(v + 0.5), ti.i32)
+                    if row >= 0 and column >= 0 and row < codes.shape[1] and column < codes.shape[2]:
+                        code = ti.cast(codes[neighbors[m], row, column], ti.i32)
+                        if code > 0:
+                            c, s = cosines[code], sines[code]
+                            offset = -(c * u + s * v)
+                            other = ti.Vector([0.0, 0.0, 0.0])
+                            for b in ti.static(range(3)):
+                                other[b] = c * cameras[m, b] + s * cameras[m, 3 + b] + offset * cameras[m, 6 + b]
+                            p, q = other.dot(e2), -other.dot(e1)
+                            if p * p + q * q >= LEAST_SINE * LEAST_SINE * other.dot(other):
+                                angle = ti.atan2(q, p) * (BINS / np.pi)
+                                angle -= ti.floor(angle / BINS) * BINS
+                                one = ti.min(ti.cast(ti.floor(angle), ti.i32), BINS - 1)
+                                # bin b holds angles b .. b + 2, so that every direction lies well inside one
+                                before = (one + BINS - 1) % BINS
+                                tally += (ti.u64(1) << ti.cast(4 * one, ti.u64)) + (
+                                    ti.u64(1) << ti.cast(4 * before, ti.u64)
+                                )
+                                agreeing += 1
+            if agreeing >= needed:
+                best, bin = 0, 0
+                for b in range(BINS):
+                    count = ti.cast(tally >> ti.cast(4 * b, ti.u64) & ti.u64(15), ti.i32)
+                    if count > best:
+                        best, bin = count, b
+                if best >= needed:
+                    if k - last > 2:  # another depth: it takes the place of the weakest
+                        slot = 0
+                        for c in ti.static(range(1, CANDIDATES)):
+                            if counts[i, c] < counts[i, slot]:
+                                slot = c
+                        if best > counts[i, slot]:
+                            counts[i, slot], found[i, slot] = best, k * BINS + bin
+                            last = k
+                    elif best > counts[i, slot]:
+                        counts[i, slot], found[i, slot] = best, k * BINS + bin
+                        last = k
+                    else:
+                        last = k
+
+
+def direction_maps(edgels, height, width):
+    """(V, H, W) uint8 on the device: where edgels run, see `stamp_directions`; and cosines and sines of the codes."""
+    angles = np.arctan2(edgels.normals[:, 1], edgels.normals[:, 0]) % np.pi
+    code = np.minimum(np.floor(angles / np.pi * CODES), CODES - 1) + 1
+    elements = np.column_stack([edgels.points, code]).astype(np.float32)
+    codes = upload(np.zeros((edgels.view_count, height, width), np.uint8))
+    nearest = upload(np.full((edgels.view_count, height, width), 255, np.uint8))
+    stamp_directions(upload(edgels.starts.astype(np.int32)), upload(elements), nearest, codes)
+    middles = (np.arange(-1, CODES) + 0.5) / CODES * np.pi
+    return codes, upload(np.cos(middles).astype(np.float32)), upload(np.sin(middles).astype(np.float32))
+
+
+def neighbor_views(views):
+    """For each view the indices of at most MOST_NEIGHBORS views that see the same from elsewhere, the best first."""
+    axes = [np.linspace(low, high, GRID) for low, high in zip(*views.box, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    cameras = zip(views.intrinsics, views.world_to_camera, strict=True)
+    seen = np.array([inside_image(project(grid, k, pose)[0], views.width, views.height) for k, pose in cameras])
+    centres = camera_centres(views)
+    towards = grid - centres[:, None]
+    towards /= np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), 1e-12)
+    chosen = []
+    for view in range(len(views)):
+        angles = np.arccos(np.clip((towards * towards[view]).sum(axis=2), -1, 1))
+        good = seen & seen[view] & (angles > LEAST_ANGLE) & (angles < MOST_ANGLE)
+        counts = good.sum(axis=1)
+        order = np.argsort(-counts, kind="stable")
+        chosen.append(order[counts[order] > 0][:MOST_NEIGHBORS])
+    return chosen
+
+
+def camera_centres(views):
+    """(V, 3) unit cube."""
+    rotations, offsets = views.world_to_camera[:, :, :3], views.world_to_camera[:, :, 3]
+    return -np.einsum("vji,vj->vi", rotations, offsets)
+
+
+def sweep_view(views, view, chosen, others, maps):
+    """Candidate points (k, 3), directions (k, 3), counts (k,), depths (k,) of the chosen edgels of one view."""
+    pixels, normals, _ = views.edgels.of_view(view)
+    pixels, normals = pixels[chosen].astype(np.float64), normals[chosen].astype(np.float64)
+    lens, pose = views.intrinsics[view], views.world_to_camera[view]
+    homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
+    rays = homogeneous @ np.linalg.inv(lens).T @ pose[:, :3]
+    planes = np.column_stack([normals, -(normals * pixels).sum(axis=1)]) @ (lens @ pose[:, :3])
+    planes /= np.linalg.norm(planes, axis=1, keepdims=True)
+    centres = camera_centres(views)
+    centre = centres[view]
+    near, far = through_box(centre, rays, views.box)
+    # Nearer, fewer than TOGETHER neighbours look from directions that MOST_ANGLE allows.
+    baselines = np.linalg.norm(centres[others] - centre, axis=1)
+    near = np.maximum(near, max(NEAREST, np.sort(baselines)[TOGETHER - 1] / np.tan(MOST_ANGLE)))
+    good = far > near
+    if not good.any():
+        return None
+    rays, planes, near, far = rays[good], planes[good], near[good], far[good]
+    projections = views.intrinsics[others] @ views.world_to_camera[others]
+    epipoles = projections @ np.append(centre, 1.0)
+    step = STEP_PX / float((views.intrinsics[others, 0, 0] * baselines).max())
+    found = upload(np.zeros((len(rays), CANDIDATES), np.int32))
+    counts = upload(np.zeros((len(rays), CANDIDATES), np.int32))
+    f32 = [upload(np.ascontiguousarray(a, np.float32)) for a in (rays, planes, np.column_stack([1 / far, 1 / near]))]
+    pair = upload(epipoles.astype(np.float32)), upload(projections[:, :, :3].reshape(-1, 9).astype(np.float32))
+    codes, cosines, sines = maps
+    sweep_rays(*f32, step, *pair, upload(others.astype(np.int32)), codes, cosines, sines, TOGETHER, found, counts)
+    found, counts = download(found), download(counts)
+    which, slot = np.nonzero(counts >= TOGETHER)
+    inverse = 1 / far[which] + (found[which, slot] // BINS) * step
+    angle = (found[which, slot] % BINS + 1) * np.pi / BINS
+    e1 = rays[which] / np.linalg.norm(rays[which], axis=1, keepdims=True)
+    e2 = np.cross(planes[which], e1)
+    directions = np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2
+    return centre + rays[which] / inverse[:, None], directions, counts[which, slot] + 1, 1 / inverse
+
+
+def through_box(origin, rays, box):
+    """Where rays enter and leave the box, in multiples of the rays; not in order where they miss it."""
+    with np.errstate(divide="ignore"):
+        sides = (box[:, None] - origin) / rays
+    return np.minimum(*sides).max(axis=1), np.maximum(*sides).min(axis=1)
+
+
+def references(edgels, lengths):
+    """(e,) bool: one edgel in each cell of EVERY_PX px, on a chain that is long; the one on the longest chain."""
+    good = np.flatnonzero(lengths >= LEAST_CHAIN)
+    cells = np.floor(edgels.points[good] / EVERY_PX).astype(np.int64)
+    keys = (edgels.views[good] * 100_000 + cells[:, 1]) * 100_000 + cells[:, 0]
+    order = np.lexsort((-lengths[good], keys))
+    first = np.unique(keys[order], return_index=True)[1]
+    chosen = np.zeros(len(edgels), bool)
+    chosen[good[order[first]]] = True
+    return chosen
+
+
+def sweep_seeds(views, lengths):
+    """SweepSeeds of all views. lengths: (e,) of the edgels' chains."""
+    maps = direction_maps(views.edgels, views.height, views.width)
+    chosen = references(views.edgels, lengths)
+    parts = []
+    for view, others in enumerate(neighbor_views(views)):
+        some = chosen[views.edgels.starts[view] : views.edgels.starts[view + 1]]
+        if len(others) >= TOGETHER and some.any():
+            found = sweep_view(views, view, some, others, maps)
+            if found is not None:
+                parts.append((*found, np.full(len(found[2]), views.intrinsics[view, 0, 0])))
+    points, directions, counts, depths, focal = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return points, directions, counts, depths / focal
