@@ -8,7 +8,6 @@ from functools import partial
 import cv2
 import numpy as np
 
-from taichi_edges.errors import UserError
 from taichi_edges.readers.frames import Frames
 
 
