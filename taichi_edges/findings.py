@@ -105,8 +105,7 @@ def describe_evaluate(facts):
     """'F-score 72.6 % at 5 mm, ..., 74.6 % at 20 mm; 7 of 8 corners closed; 3 views held out: ...'; '2 edges, ...'."""
     if facts["ground_truth"] is None:
         length, ends = f"{facts['predicted_length_units']:.2f} units long", amount(facts["free_ends"], "free end")
-        found = f"{amount(facts['edges'], 'edge')}, {length}, {ends}"
-        return f"{found}{describe_held_out(facts) or '; there is no ground truth'}"
+        return f"{amount(facts['edges'], 'edge')}, {length}, {ends}; there is no ground truth{describe_held_out(facts)}"
     shares = [f"{facts[f'f_score_{limit}mm_percent']:.1f} % at {limit} mm" for limit in (5, 10, 20)]
     corners = f"; {facts['corners_closed']} of {facts['corners']} corners closed" if facts.get("corners") else ""
     return f"F-score {', '.join(shares)}{corners}{describe_held_out(facts)}"
@@ -114,7 +113,7 @@ def describe_evaluate(facts):
 
 def describe_held_out(facts):
     """'; 3 views held out: precision 93.1 %, recall 62.4 % of long edges', '' where none were."""
-    precision, recall = facts["held_out_precision_percent"], facts["held_out_recall_long_percent"]
+    precision, recall = (facts.get(f"held_out_{share}_percent") for share in ("precision", "recall_long"))
     shares = [f"precision {precision:.1f} %"] if precision is not None else []
     shares += [f"recall {recall:.1f} % of long edges"] if recall is not None else []
     return f"; {amount(facts['held_out_views'], 'view')} held out: {', '.join(shares)}" if shares else ""

@@ -82,7 +82,13 @@ def test_a_split_keeps_every_view_and_its_edgels_on_one_side(generator):
         np.testing.assert_array_equal(half.world_to_camera[view], views.world_to_camera[original])
         for one, other in zip(half.edgels.of_view(view), views.edgels.of_view(original), strict=True):
             np.testing.assert_array_equal(one, other)
-    assert len(split_views(views, [])[1]) == 0
+    for without_edgels in (
+        views,
+        replace(views, edgels=None),
+        replace(views, edgels=views.edgels.keep(np.zeros(len(views.edgels), bool))),
+    ):
+        all_of_them, none = split_views(without_edgels, [])
+        assert len(all_of_them) == 5 and len(none) == 0
 
 
 # ----------------------------------------------------------------------------------------------------------- geometry

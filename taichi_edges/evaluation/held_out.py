@@ -78,7 +78,7 @@ def _some_views(views, chosen):
         edge_maps=views.edge_maps[chosen],
         intrinsics=views.intrinsics[chosen],
         world_to_camera=views.world_to_camera[chosen],
-        edgels=edgels and Edgels.of_views([edgels.of_view(view) for view in chosen]),
+        edgels=None if edgels is None else Edgels.of_views([edgels.of_view(view) for view in chosen]),
     )
 
 
