@@ -250,10 +250,18 @@ def _auto_or(value, check):
     return value if value == "auto" else check(value)
 
 
-class EvaluationConfig(Section):
-    """Ground truth, where there is one."""
+def _is_held_out(value):
+    names = isinstance(value, list) and value and all(isinstance(name, str) for name in value)
+    return bool(names) or (type(value) is int and value > 0)
 
-    truth: str = Field("", description="ABC folder, PLY or edge JSON, relative to the data root; '': no evaluation")
+
+class EvaluationConfig(Section):
+    """Ground truth, where there is one, and views that only the evaluation sees."""
+
+    truth: str = Field("", description="ABC folder, PLY or edge JSON, relative to the data root; '': there is none")
+    held_out: Annotated[str | int | list[str], _measured_or(_is_held_out, "a number, or a list of names, of views")] = (
+        Field("auto", description="views kept for the evaluation: their number or names; auto: one in ten, at most 3")
+    )
 
 
 class SceneConfig(Section):
