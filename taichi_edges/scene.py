@@ -36,8 +36,12 @@ class OnnxConfig(Section):
 class SourceConfig(Section):
     """Where edge maps and cameras come from."""
 
-    reader: Literal["nerf", "emap", "colmap", "idr", "synthetic"] = Field("emap", description="layout of the folder, see README")
-    path: str = Field("", description="folder, relative to the data root (--data or TAICHI_EDGES_DATA) or absolute")
+    reader: Literal["auto", "colmap", "emap", "idr", "images", "nerf", "nerfstudio", "synthetic"] = Field(
+        "auto", description="layout of the folder, see docs/inputs.md; auto: recognised from what is in it"
+    )
+    path: str = Field(
+        "", description="folder, or the file in it that lists the views; relative to the data root or absolute"
+    )
     edges: str = Field("", description="folder of ready edge maps inside `path`, e.g. edge_DexiNed")
     images: str = Field("", description="folder of the colour images inside `path`; '': where the layout has them")
     detector: Literal["auto", "maps", "subpixel", "onnx"] = Field(
@@ -131,8 +135,10 @@ class TrainConfig(Section):
         0.0, description="stop when the last two passes lowered the loss by no more than this share each; 0: never"
     )
     gaussians: Count = Field(10_000, description="number of random points to start from")
-    seeds: Literal["random", "points", "votes"] = Field(
-        "random", description="random points in the box, source.points, or where many views agree on an edge"
+    seeds: Literal["random", "points", "given", "votes"] = Field(
+        "random",
+        description="random points in the box; source.points; given: points that came with the images or source.points,"
+        " if any, else random; votes: where many views agree on an edge",
     )
     initial_scale: Positive = Field(0.004, description="standard deviation, unit-cube units")
     initial_opacity: Annotated[float, Field(gt=0, lt=1)] = Field(0.08)
@@ -232,6 +238,7 @@ class SceneConfig(Section):
 
     name: Name = Field("scene", description="folder of the results; the file's name unless set")
     preset: Literal["fast", "paper"] = Field("fast", description="the schedule the scene starts from")
+    scale: Literal["object", "building", "room"] = Field("object", description="settings for scenes of this size")
     seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of every random choice")
     box: Annotated[list[Point], Field(min_length=2, max_length=2)] = Field(
         [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], description="opposite corners of the scene, input units"
@@ -332,4 +339,14 @@ PRESETS = {
         "filter": {"refine": True},
         "refine": {"enabled": True},
     },
+}
+
+# What a preset says otherwise for scenes of other sizes, on top of it and below the scene file: SCALES[scale][preset].
+LARGE_IN_THE_PAPER = {  # supplement: "for large scenes" lambda_1 = lambda_2 = 0.01, k = 4 as ever, seeded by SfM points
+    "train": {"seeds": "given", "orient_weight": 0.01, "shape_weight": 0.01},
+}
+SCALES = {
+    "object": {"paper": {}, "fast": {}},
+    "building": {"paper": LARGE_IN_THE_PAPER, "fast": {}},
+    "room": {"paper": LARGE_IN_THE_PAPER, "fast": {}},
 }
