@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Parametric 3D edges from images: `python run.py scenes/castle_p19.yaml` or `run.py my_photos/`. Argument parsing only."""
+"""Parametric 3D edges from images: `python run.py scenes/demo.yaml` or `run.py my_photos/`. Argument parsing only."""
 
 import argparse
 import os

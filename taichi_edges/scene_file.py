@@ -1,7 +1,7 @@
 """Scene files: one YAML file = one scene.
 
 Unknown and mistyped keys are refused by name. Precedence: defaults < preset < scale < scene file < `--preset` and
-`--scale` given on the command line < `--set key=value`. A folder given in place of a scene file is a scene without keys.
+`--scale` given on the command line < `--set key=value`. A folder in place of a scene file is a scene without keys.
 """
 
 import difflib
@@ -13,7 +13,6 @@ from pydantic import ValidationError
 
 from taichi_edges.errors import UserError, did_you_mean
 from taichi_edges.scene import PRESETS, SCALES, SceneConfig, Section
-
 
 LISTING_SUFFIXES = (".json", ".npz", ".bin", ".txt")  # of files that list the views of a source
 
@@ -109,10 +108,9 @@ def is_source(path):
 
 def _folder_content(path):
     """The scene that a folder without a scene file is: its own path and name, everything else as by default."""
-    from taichi_edges.readers.recognition import recognise, scene_name
+    from taichi_edges.readers.recognition import scene_name
 
-    found = recognise(path)
-    return {"name": scene_name(found.folder), "source": {"reader": "auto", "path": str(path.resolve())}}
+    return {"name": scene_name(path), "source": {"reader": "auto", "path": str(path.resolve())}}
 
 
 def _file_content(path):

@@ -249,6 +249,8 @@ def _start(run, views, generator):
         seeds, instead = ("points", "source.points") if run.config.source.points else ("random", "random points")
         found = f"the views agree on an edge in fewer than {LEAST_VOTED} places"
         run.progress.warn(f"{found}; the training starts from {instead} instead")
+    if seeds == "given":
+        seeds = "points" if run.path("seeds.ply").is_file() else "random"
     if seeds == "points":
         given = stack_fields(read_vertices(run.path("seeds.ply"), ("x", "y", "z")), ("x", "y", "z"))
         points = given_points(views.similarity.to_unit(given.astype(np.float64)), config.gaussians, generator)
@@ -258,8 +260,8 @@ def _start(run, views, generator):
 
 
 def seed_files(run):
-    """The points that training starts from, where the scene names some."""
-    return [run.path("seeds.ply")] if run.config.source.points else []
+    """The points that training starts from, where there are any."""
+    return [run.path("seeds.ply")] if run.config.source.points or run.path("seeds.ply").is_file() else []
 
 
 def _write_csv(path, rows):

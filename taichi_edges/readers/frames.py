@@ -39,10 +39,11 @@ class Frames:
     gone. opengl: are those OpenGL axes? size: (width, height) if the file says so. input_to_truth: (4, 4).
 
     lenses: (V,) photogrammetry.Lens where the layout knows one, else None; its pictures are undistorted before anything
-    looks at them. mask_paths: (V,) images that show 128 or more where the picture counts, '' for all of it. valid_paths:
-    (V,) images that are 0 where undistortion left nothing, '' where it left no such place. points: (n, 3) of structure
-    from motion, input units, None where the layout has none. box: (2, 3) corners of the scene, input units, where the
-    layout knows or can tell. files: what the reader read beyond `where`. notes, warnings: what it has to say about it.
+    looks at them. mask_paths: (V,) images that show 128 or more where the picture counts, '' for all of it.
+    valid_paths: (V,) images that are 0 where undistortion left nothing, '' where it left no such place. points: (n, 3)
+    of structure from motion, input units, None where the layout has none. box: (2, 3) corners of the scene, input
+    units, where the layout knows or can tell. files: what the reader read beyond `where`. notes, warnings: what it has
+    to say about it.
     """
 
     where: Path

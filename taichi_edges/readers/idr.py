@@ -76,7 +76,9 @@ def _check_count(where, cameras, images):
         raise UserError(f"{where}: holds no world_mat_0; are these the cameras of IDR's layout?")
     if count != len(images):
         problem = f"{count} cameras (world_mat_i) for {len(images)} images in {images[0].parent.name}"
-        raise UserError(f"{where}: {problem}; the i-th image, by name, belongs to world_mat_i: put back what is missing")
+        raise UserError(
+            f"{where}: {problem}; the i-th image, by name, goes with world_mat_i: put back what is missing"
+        )
 
 
 def _masks(folder, names, skip):

@@ -1,14 +1,14 @@
-"""What a folder holds: which reader its layout wants. For `source.reader: auto`, and for a folder in place of a scene."""
+"""Which reader a folder wants, from what is in it: for `source.reader: auto`, and for a folder in place of a scene."""
 
 import os
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from taichi_edges.errors import UserError, name_some
 from taichi_edges.readers.colmap import MODEL_FOLDERS
 from taichi_edges.readers.frames import read_json
-from taichi_edges.readers.idr import CAMERA_FILES, IMAGE_FOLDERS
+from taichi_edges.readers.idr import IMAGE_FOLDERS, camera_file
 from taichi_edges.readers.image_files import first_folder, image_files
 
 KNOWN = (
@@ -17,7 +17,16 @@ KNOWN = (
 )
 SPLITS = ("train", "val", "test")
 PHOTO_FOLDERS = ("", "images", "photos", "image", "rgb", "color")
-PARTS_OF_A_PROJECT = ("sparse", "colmap", "dense", "images", "image", "photos", "rgb", "color")  # folders that name none
+PARTS_OF_A_PROJECT = (
+    "sparse",
+    "colmap",
+    "dense",
+    "images",
+    "image",
+    "photos",
+    "rgb",
+    "color",
+)  # no names of scenes
 MOST_LISTED = 8
 
 
@@ -25,21 +34,23 @@ MOST_LISTED = 8
 class Found:
     """A layout that was recognised.
 
-    reader: of READERS. layout: what it is, in words. folder: of the scene. listing: the file or folder that lists its
-    views, relative to `folder`. source: more keys of the section `source`. views: how many it lists.
+    reader: of READERS. layout: what it is, in words. path: the source.path for it, a folder or a file that lists views.
+    listing: the file or folder that lists them. views: how many. source: more keys for the section `source`.
     """
 
     reader: str
     layout: str
-    folder: Path
-    listing: str
+    path: Path
+    listing: Path
     views: int
-    source: dict
+    source: dict = field(default_factory=dict)
 
     def __str__(self):
-        what = "photographs" if self.reader == "images" else "images"
-        listing = "" if self.listing in ("", ".") else f"{self.listing}, "
-        return f"{self.layout} ({listing}{self.views} {what})"
+        if self.reader == "images":
+            return f"{self.views} {self.layout}"
+        inside = self.listing != self.path and self.listing.is_relative_to(self.path)
+        listing = self.listing.relative_to(self.path) if inside else self.listing.name
+        return f"{self.layout} ({listing}, {self.views} images)"
 
 
 def recognise(path):
@@ -49,37 +60,41 @@ def recognise(path):
         return _of_file(path)
     found = [layout for find in FINDERS for layout in [find(path)] if layout]
     if len(found) > 1:
-        listings = " or ".join(str(layout.folder / layout.listing) for layout in found)
-        kinds = ", ".join(f"{layout.layout} ({layout.listing})" for layout in found)
-        raise UserError(f"{path}: holds {kinds}: set source.reader, or name one of them: {listings}")
+        kinds = " and ".join(layout.layout for layout in found)
+        listings = " or ".join(str(layout.listing) for layout in found)
+        raise UserError(f"{path}: holds {kinds}: give {listings} in its place, or set source.reader in a scene file")
     if found:
         return found[0]
     photographs = _photographs(path)
     if photographs:
         return photographs
-    raise UserError(
-        f"{path}: is a folder, not a scene file, and of no known layout; it holds {_contents(path)}; known: {KNOWN}"
-    )
+    unknown = "is a folder, not a scene file, and of no known layout"
+    raise UserError(f"{path}: {unknown}; it holds {_contents(path)}; known are {KNOWN}")
 
 
 def recognised_source(path, source):
-    """The `source` section of a scene with the reader that fits what is at `path`, and the Found."""
+    """The section `source` with the reader that fits what is at `path`, and the Found."""
     found = recognise(path)
-    changes = {key: value for key, value in found.source.items() if not getattr(source, key)} | {"reader": found.reader}
-    if "split" in found.source:
-        changes["split"] = found.source["split"]
-    if found.folder != path:
-        changes["path"] = str(found.folder.resolve())
+    unset = {key: value for key, value in found.source.items() if key == "split" or not getattr(source, key)}
+    changes = {"reader": found.reader, **unset}
+    if found.path != path:
+        changes["path"] = str(found.path.resolve())
     return source.model_copy(update=changes), found
 
 
 def scene_name(folder):
-    """A name for a scene that is but a folder: the folder's, or that of the project which the folder is a part of."""
+    """A name for a scene that is but a folder or a file in it: that of the project which the folder is a part of."""
     folder = Path(folder).resolve()
-    while folder.parent != folder and (folder.name.lower() in PARTS_OF_A_PROJECT or folder.name.isdigit()):
+    folder = folder.parent if folder.is_file() else folder
+    while folder.parent != folder and _is_part(folder):
         folder = folder.parent
     name = re.sub(r"[^A-Za-z0-9._-]+", "-", folder.name).lstrip("._-").rstrip("-")
     return name or "scene"
+
+
+def _is_part(folder):
+    """Whether the folder only holds something of a project, and thus has no name of its own: sparse, sparse/0."""
+    return folder.name.lower() in PARTS_OF_A_PROJECT or (folder.name.isdigit() and folder.parent.name == "sparse")
 
 
 def _contents(folder):
@@ -96,7 +111,7 @@ def _of_file(path):
     if path.suffix in (".bin", ".txt") and path.stem in ("cameras", "images", "points3D", "frames", "rigs"):
         return recognise(folder)
     if name == "meta_data.json":
-        return _meta_data(folder)
+        return _meta_data(path)
     split = re.fullmatch(r"transforms_(.+)\.json", name)
     if split:
         return _transforms_of_split(folder, split[1])
@@ -120,17 +135,17 @@ def _frames_in(path):
 
 def find_colmap(folder):
     """A COLMAP project, or a model in it. nerfstudio keeps the model that its transforms.json comes from in colmap/."""
-    own = [name for name in MODEL_FOLDERS if not (name.startswith("colmap") and (folder / "transforms.json").is_file())]
-    model = next((folder / name for name in (*own, "0") if _is_model(folder / name)), None)
+    has_transforms = (folder / "transforms.json").is_file()
+    places = [name for name in MODEL_FOLDERS if not (has_transforms and name.startswith("colmap"))]
+    model = next((folder / name for name in (*places, "0") if _is_model(folder / name)), None)
     if model is None:
         return None
     project = _project_of(model)
-    listing = os.path.relpath(model, project)
     images = _count_below(project / "images")
-    if listing in MODEL_FOLDERS:
-        return Found("colmap", "a COLMAP project", project, listing, images, {})
-    beside = os.path.relpath(project / "images", model)  # one of several models: sparse/1
-    return Found("colmap", "a COLMAP model", model, "", images, {"images": beside})
+    if any(model == project / name for name in MODEL_FOLDERS):
+        return Found("colmap", "a COLMAP project", project, model, images)
+    images_beside = {"images": os.path.relpath(project / "images", model)}  # one of several models, as in sparse/1
+    return Found("colmap", "a COLMAP model", model, model, images, images_beside)
 
 
 def _is_model(folder):
@@ -139,12 +154,12 @@ def _is_model(folder):
 
 def _project_of(model):
     """The folder around a model that holds its images; the model's own where there is none."""
-    around = [model, *list(model.resolve().parents)[:3]]
-    return next((folder for folder in around if (folder / "images").is_dir()), model)
+    model = model.resolve()
+    return next((folder for folder in [model, *model.parents[:3]] if (folder / "images").is_dir()), model)
 
 
 def _count_below(folder):
-    """Image files in a folder and those below it, as COLMAP lists them."""
+    """Image files in a folder and those below it, which is how COLMAP lists them."""
     return sum(len(image_files(path)) for path in [folder, *(p for p in folder.rglob("*") if p.is_dir())])
 
 
@@ -155,9 +170,8 @@ def find_transforms(folder):
 
 
 def _transforms(path):
-    layout = "nerfstudio's transforms.json" if path.name == "transforms.json" else "a listing like nerfstudio's"
-    folder = path.parent if path.name == "transforms.json" else path
-    return Found("nerfstudio", layout, folder, path.name if folder != path else "", _frames_in(path), {})
+    usual = path.name == "transforms.json"
+    return Found("nerfstudio", f"nerfstudio's {path.name}", path.parent if usual else path, path, _frames_in(path))
 
 
 def find_transforms_of_splits(folder):
@@ -167,46 +181,47 @@ def find_transforms_of_splits(folder):
 
 
 def _transforms_of_split(folder, split):
-    """nerfstudio's keys stand in files of splits, too."""
+    """The transforms of a split, which may have nerfstudio's keys."""
     path = folder / f"transforms_{split}.json"
     content = _json_keys(path)
     frames = content.get("frames")
     first = frames[0] if isinstance(frames, list) and frames and isinstance(frames[0], dict) else {}
     if "fl_x" in content or "fl_x" in first:
-        return Found("nerfstudio", f"nerfstudio's {path.name}", path, "", _frames_in(path), {})
-    return Found("nerf", "a NeRF (Blender) scene", folder, path.name, _frames_in(path), {"split": split})
+        return _transforms(path)
+    return Found("nerf", "a NeRF (Blender) scene", folder, path, _frames_in(path), {"split": split})
 
 
 def find_meta_data(folder):
     """EMAP's meta_data.json."""
-    return _meta_data(folder) if (folder / "meta_data.json").is_file() else None
+    path = folder / "meta_data.json"
+    return _meta_data(path) if path.is_file() else None
 
 
-def _meta_data(folder):
-    return Found("emap", "an EMAP folder", folder, "meta_data.json", _frames_in(folder / "meta_data.json"), {})
+def _meta_data(path):
+    return Found("emap", "an EMAP scene", path.parent, path, _frames_in(path))
 
 
 def find_cameras(folder):
     """The cameras of IDR and NeuS."""
-    path = next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
-    return _cameras(path) if path else None
+    path = camera_file(folder)
+    return _cameras(path) if path.is_file() else None
 
 
 def _cameras(path):
-    folder = path.parent
-    views = len(image_files(first_folder(folder, IMAGE_FOLDERS)))
-    chosen = next((name for name in CAMERA_FILES if (folder / name).is_file()), None)
-    if path.name == chosen:
-        return Found("idr", "DTU's layout of IDR and NeuS", folder, path.name, views, {})
-    return Found("idr", "DTU's layout of IDR and NeuS", path, "", views, {})
+    views = len(image_files(first_folder(path.parent, IMAGE_FOLDERS)))
+    usual = path.name == camera_file(path.parent).name
+    return Found("idr", "a DTU scene in IDR's layout", path.parent if usual else path, path, views)
 
 
 def _photographs(folder):
-    """Photographs without any poses."""
-    place = next((name for name in PHOTO_FOLDERS if image_files(folder / name)), None)
+    """Photographs without any poses. Where they are part of a project that has some, that is said."""
+    place = next((folder / name for name in PHOTO_FOLDERS if image_files(folder / name)), None)
     if place is None:
         return None
-    return Found("images", "photographs without poses", folder / place, "", len(image_files(folder / place)), {})
+    project = place.resolve().parent
+    around = next((found for find in FINDERS for found in [find(project)] if found), None)
+    hint = f"; {project} is {around.layout}, name that to use its poses" if around else ""
+    return Found("images", f"photographs without poses{hint}", place, place, len(image_files(place)))
 
 
 FINDERS = (find_colmap, find_transforms, find_transforms_of_splits, find_meta_data, find_cameras)
