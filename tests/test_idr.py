@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from taichi_edges.cameras import invert_pose, project
+from taichi_edges.cameras import inside_image, invert_pose, project
 from taichi_edges.errors import UserError
 from taichi_edges.readers.idr import decompose, read_idr
 from taichi_edges.scene import SourceConfig
@@ -138,7 +138,7 @@ def test_masks_of_another_number_and_other_names_are_refused(folder):
 def test_without_masks_there_are_none(folder):
     for path in (folder.path / "mask").iterdir():
         path.unlink()
-    assert not folder.read().mask_paths
+    assert not any(folder.read().mask_paths)
 
 
 def test_an_image_without_its_camera_is_refused(folder):
@@ -209,7 +209,7 @@ def test_scan37_is_read():
     assert len(frames.names) == 49 and frames.mask_paths[7].name == "007.png"
     side = frames.box[1] - frames.box[0]
     np.testing.assert_allclose(side, 512.1, atol=0.1)  # millimetres
-    # DTU's robot looks at the object: the box's centre is in the middle half of every image.
+    # DTU's robot looks at the object: the box's centre is in every image.
     for intrinsics, pose in zip(frames.intrinsics, frames.camera_to_world):
         pixel, depth = project(frames.box.mean(axis=0)[None], intrinsics(1600, 1200), invert_pose(pose))
-        assert depth[0] > 500 and (np.abs(pixel[0] - [800, 600]) < [400, 300]).all()
+        assert depth[0] > 500 and inside_image(pixel, 1600, 1200)[0]

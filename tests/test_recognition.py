@@ -67,19 +67,13 @@ def test_transforms_of_a_split_may_have_the_keys_of_nerfstudio(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "reader", "path"),
-    [
-        ("sparse/0", "colmap", "."),
-        ("sparse", "colmap", "."),
-        ("sparse/0/images.bin", "colmap", "."),
-        ("sparse/1", "colmap", "sparse/1"),
-    ],
+    ("given", "model"),
+    [("sparse/0", "sparse/0"), ("sparse", ""), ("sparse/0/images.bin", "sparse/0"), ("sparse/1", "sparse/1"), ("", "")],
 )
-def test_a_part_of_a_colmap_project_stands_for_the_project(tmp_path, given, reader, path):
+def test_a_part_of_a_colmap_project_stands_for_the_project(tmp_path, given, model):
     build(tmp_path, "images/a.jpg", "sparse/0/images.bin", "sparse/1/images.bin")
     source, found = recognised_source(tmp_path / given, SourceConfig(path=given))
-    assert (found.reader, found.path) == (reader, tmp_path / path)
-    assert (found.path / (source.images or "images")).resolve() == tmp_path / "images"
+    assert (found.reader, found.path, source.model) == ("colmap", tmp_path, model)
     assert scene_name(tmp_path / given) == scene_name(tmp_path)
 
 
@@ -127,9 +121,9 @@ def test_photographs_of_a_project_with_poses_say_so(tmp_path):
 
 
 def test_keys_of_the_scene_are_kept(tmp_path):
-    build(tmp_path, "images/a.jpg", "sparse/1/images.bin")
-    source, _ = recognised_source(tmp_path / "sparse" / "1", SourceConfig(path="x", images="/elsewhere", edges="maps"))
-    assert (source.images, source.edges) == ("/elsewhere", "maps")
+    build(tmp_path, "images/a.jpg", "sparse/0/images.bin", "sparse/1/images.bin")
+    source, _ = recognised_source(tmp_path / "sparse" / "1", SourceConfig(path="x", model="sparse/0", edges="maps"))
+    assert (source.model, source.edges) == ("sparse/0", "maps")
 
 
 @pytest.mark.parametrize(

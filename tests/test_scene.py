@@ -365,7 +365,7 @@ def test_every_preset_knows_every_scale():
 def test_large_scenes_have_the_numbers_of_the_supplement(scene, scale):
     train = load_scene(scene(f"preset: paper\nscale: {scale}")).train
     assert (train.orient_weight, train.shape_weight, train.neighbors) == (0.01, 0.01, 4)
-    assert train.seeds == "given"  # SfM points, where there are any
+    assert train.seeds == "auto"  # SfM points, where there are any
 
 
 def test_a_scale_lies_between_the_preset_and_the_scene(scene):

@@ -64,6 +64,11 @@ class Frames:
     notes: tuple = ()
     warnings: tuple = ()
 
+    def __post_init__(self):
+        for key, nothing in (("lenses", None), ("mask_paths", ""), ("valid_paths", "")):
+            if not getattr(self, key):
+                object.__setattr__(self, key, [nothing] * len(self.names))
+
 
 def read_json(path, what):
     """A JSON file as Python; `what` names it in the message when it is missing or broken."""

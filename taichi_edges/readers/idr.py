@@ -12,12 +12,12 @@ from functools import partial
 import numpy as np
 
 from taichi_edges.errors import UserError
+from taichi_edges.readers.companions import mask_folder
 from taichi_edges.readers.frames import Frames, folders_in, matrix
 from taichi_edges.readers.image_files import files_of_views, first_folder, image_files, refuse_missing
 
 CAMERA_FILES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 IMAGE_FOLDERS = ("image", "images", "rgb")
-MASK_FOLDERS = ("mask", "masks")
 NO_SKEW = 1e-5  # of the focal length: below, it is the rounding of a matrix stored as float32
 
 
@@ -37,7 +37,7 @@ def read_idr(path, config):
         intrinsics=[partial(_of_any_size, intrinsics) for intrinsics, _ in parts],
         camera_to_world=[pose for _, pose in parts],
         opengl=False,
-        mask_paths=_masks(folder, names, config.skip),
+        mask_paths=_masks(folder, names, config),
         box=_box_of_sphere(cameras, where),
     )
 
@@ -76,18 +76,16 @@ def _check_count(where, cameras, images):
         raise UserError(f"{where}: holds no world_mat_0; are these the cameras of IDR's layout?")
     if count != len(images):
         problem = f"{count} cameras (world_mat_i) for {len(images)} images in {images[0].parent.name}"
-        raise UserError(
-            f"{where}: {problem}; the i-th image, by name, goes with world_mat_i: put back what is missing"
-        )
+        raise UserError(f"{where}: {problem}; the i-th image, by name, goes with world_mat_i: put back what is missing")
 
 
-def _masks(folder, names, skip):
+def _masks(folder, names, config):
     """The paths of the masks; none where there is no folder of them."""
-    masks = next((folder / name for name in MASK_FOLDERS if image_files(folder / name)), None)
-    if masks is None:
+    masks = mask_folder(folder, config)
+    if masks is None or not (config.masks or image_files(masks)):
         return []
     paths = files_of_views(masks, names, "mask")
-    refuse_missing(masks, paths, names, "mask", skip)
+    refuse_missing(masks, paths, names, "mask", config.skip)
     return paths
 
 

@@ -4,8 +4,7 @@ import re
 from pathlib import Path
 
 from taichi_edges.errors import UserError, name_some
-
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+from taichi_edges.readers.companions import is_picture
 
 
 def image_files(folder):
@@ -13,22 +12,13 @@ def image_files(folder):
     folder = Path(folder)
     if not folder.is_dir():
         return []
-    files = (path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith("."))
+    files = (path for path in folder.iterdir() if is_picture(path) and not path.name.startswith("."))
     return sorted(path for path in files if path.is_file())
 
 
 def first_folder(folder, names):
     """The first of the folders that holds images, or the first one where none does."""
     return next((folder / name for name in names if image_files(folder / name)), folder / names[0])
-
-
-def beside(folder, name):
-    """The image of that name in a folder, of whatever suffix it is there; edge maps of JPEG images are often PNG."""
-    path = Path(folder) / name
-    if path.is_file():
-        return path
-    others = (path.with_suffix(suffix) for suffix in SUFFIXES)
-    return next((other for other in others if other.is_file()), path.with_suffix(".png"))
 
 
 def files_of_views(folder, names, what):

@@ -17,10 +17,15 @@ def read_points(path, box):
     if len(points) == 0:
         raise UserError(f"source.points: {path} holds no points that can be read; give a PLY with x, y and z")
     finite = points[np.isfinite(points).all(axis=1)]
-    low, high = np.asarray(box, dtype=np.float64)
-    inside = finite[((finite >= low) & (finite <= high)).all(axis=1)]
+    inside = inside_box(finite, box)
     if len(inside) == 0:
         raise UserError(
             f"source.points: none of the {len(points)} points of {path} lies in the box; correct box or the file"
         )
     return inside
+
+
+def inside_box(points, box):
+    """Those of the (n, 3) points that lie in the box, (2, 3) corners."""
+    low, high = np.asarray(box, dtype=np.float64)
+    return points[((points >= low) & (points <= high)).all(axis=1)]

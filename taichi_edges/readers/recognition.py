@@ -1,6 +1,5 @@
 """Which reader a folder wants, from what is in it: for `source.reader: auto`, and for a folder in place of a scene."""
 
-import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -137,25 +136,26 @@ def find_colmap(folder):
     """A COLMAP project, or a model in it. nerfstudio keeps the model that its transforms.json comes from in colmap/."""
     has_transforms = (folder / "transforms.json").is_file()
     places = [name for name in MODEL_FOLDERS if not (has_transforms and name.startswith("colmap"))]
-    model = next((folder / name for name in (*places, "0") if _is_model(folder / name)), None)
-    if model is None:
+    models = next((models for name in places for models in [_models(folder / name)] if models), None)
+    if models is None:
         return None
-    project = _project_of(model)
-    images = _count_below(project / "images")
-    if any(model == project / name for name in MODEL_FOLDERS):
-        return Found("colmap", "a COLMAP project", project, model, images)
-    images_beside = {"images": os.path.relpath(project / "images", model)}  # one of several models, as in sparse/1
-    return Found("colmap", "a COLMAP model", model, model, images, images_beside)
+    project = _project_of(models[0])
+    listing = models[0] if len(models) == 1 else models[0].parent
+    source = {"model": str(folder.resolve().relative_to(project))} if models == [folder] != [project] else {}
+    return Found("colmap", "a COLMAP project", project, listing, _count_below(project / "images"), source)
 
 
-def _is_model(folder):
-    return any((folder / f"images.{kind}").is_file() for kind in ("bin", "txt"))
+def _models(folder):
+    """The COLMAP models in a folder: in its folders 0, 1, ... or in itself."""
+    parts = sorted(folder.glob("[0-9]*"))
+    return [path for path in (*parts, folder) if any((path / f"images.{kind}").is_file() for kind in ("bin", "txt"))]
 
 
 def _project_of(model):
     """The folder around a model that holds its images; the model's own where there is none."""
-    model = model.resolve()
-    return next((folder for folder in [model, *model.parents[:3]] if (folder / "images").is_dir()), model)
+    if (model / "images").is_dir():
+        return model
+    return next((folder for folder in model.resolve().parents[:3] if (folder / "images").is_dir()), model)
 
 
 def _count_below(folder):
