@@ -92,10 +92,19 @@ def _reconstruction_of(folder, _states):
     import pycolmap
 
     try:
-        return as_reconstruction(pycolmap.Reconstruction(str(folder)))
+        model = pycolmap.Reconstruction(str(folder))
+        _refuse_cut_cameras(folder / "cameras.bin", model)
+        return as_reconstruction(model)
     except (ValueError, RuntimeError, IndexError, MemoryError) as error:
         reason = str(error) or type(error).__name__
         raise UserError(f"{folder}: not a COLMAP model that can be read ({reason}); export or copy it again") from error
+
+
+def _refuse_cut_cameras(path, model):
+    """ValueError where a binary file of cameras ends early, the one that pycolmap does not notice."""
+    whole = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
+    if path.is_file() and path.stat().st_size < whole:
+        raise ValueError(f"{path.name} is truncated")
 
 
 def as_reconstruction(model):

@@ -34,6 +34,7 @@ def frames_of_model(folder, model, images, config, notes=()):
     keep = np.flatnonzero(there)
     masks, mask_warnings = mask_paths(folder, config, [found.names[i] for i in keep])
     points = _good_points(found, config)
+    boxes = (scene_box(each, found.camera_to_world) for each in (points, found.points))  # better a rough one than none
     return Frames(
         where=where,
         names=_view_names([found.names[i] for i in keep]),
@@ -45,7 +46,7 @@ def frames_of_model(folder, model, images, config, notes=()):
         lenses=[found.lenses[i] for i in keep],
         mask_paths=masks,
         points=points,
-        box=scene_box(points, found.camera_to_world),
+        box=next((box for box in boxes if box is not None), None),
         files=tuple(files),
         notes=notes,
         warnings=(*_missing(found.names, there, images), *_unregistered(images, found.names, folder), *mask_warnings),

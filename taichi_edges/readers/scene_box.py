@@ -26,6 +26,7 @@ def scene_box(points, camera_to_world):
 
     points: (n, 3), without the worst. camera_to_world: (V, 4, 4), OpenCV axes.
     """
+    points = points[np.isfinite(points).all(axis=1)]
     if len(points) < FEWEST:
         return None
     chosen = points[_about_the_focus(points, camera_to_world)]
