@@ -47,10 +47,12 @@ class OnnxConfig(Section):
 class SourceConfig(Section):
     """Where edge maps and cameras come from."""
 
-    reader: Literal["nerf", "emap", "colmap", "idr", "synthetic"] = Field(
-        "emap", description="layout of the folder, see README"
+    reader: Literal["auto", "colmap", "emap", "idr", "images", "nerf", "nerfstudio", "synthetic"] = Field(
+        "auto", description="layout of the folder, see docs/inputs.md; auto: recognised from what is in it"
     )
-    path: str = Field("", description="folder, relative to the data root (--data or TAICHI_EDGES_DATA) or absolute")
+    path: str = Field(
+        "", description="folder, or the file in it that lists the views; relative to the data root or absolute"
+    )
     edges: str = Field("", description="folder of ready edge maps inside `path`, e.g. edge_DexiNed")
     images: str = Field("", description="folder of the colour images inside `path`; '': where the layout has them")
     masks: str = Field(
@@ -269,6 +271,7 @@ class SceneConfig(Section):
 
     name: Name = Field("scene", description="folder of the results; the file's name unless set")
     preset: Literal["fast", "paper"] = Field("fast", description="the schedule the scene starts from")
+    scale: Literal["object", "building", "room"] = Field("object", description="settings for scenes of this size")
     seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of every random choice")
     box: Annotated[Box, WrapValidator(_auto_or), PlainSerializer(lambda box: box)] = Field(
         "auto", description="opposite corners of the scene, input units; auto: the layout's, else the unit cube"
@@ -369,4 +372,14 @@ PRESETS = {
         "filter": {"refine": True},
         "refine": {"enabled": True},
     },
+}
+
+# What a preset says otherwise for scenes of other sizes, on top of it and below the scene file: SCALES[scale][preset].
+LARGE_IN_THE_PAPER = {  # supplement: "for large scenes" lambda_1 = lambda_2 = 0.01, k = 4 as ever, seeded by SfM points
+    "train": {"seeds": "auto", "orient_weight": 0.01, "shape_weight": 0.01},
+}
+SCALES = {
+    "object": {"paper": {}, "fast": {}},
+    "building": {"paper": LARGE_IN_THE_PAPER, "fast": {}},
+    "room": {"paper": LARGE_IN_THE_PAPER, "fast": {}},
 }
