@@ -9,6 +9,7 @@ stage that needs it: a run that is up to date, and a mistake in the scene file, 
 import csv
 import io
 import json
+import os
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -24,40 +25,90 @@ from taichi_edges.views import read_views, write_views
 from taichi_edges.wireframe import read_wireframe, write_wireframe
 
 WIDEST_PX = 40.0  # of a detector's lines
+UNIT_CUBE = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 CALIBRATION_SEEDS = 4000  # 3D points through which a detector's biases are measured, at most
 
 
 def prepare(run):
-    """Source -> `views.npz` and `detection.png`; of synthetic scenes also `truth.json` and pictures in `images/`."""
+    """Source -> `views.npz`, `held_out.npz` (views for the evaluation alone) and `detection.png`.
+
+    Of synthetic scenes also `truth.json` and pictures in `images/`.
+    """
     if run.config.source.reader == "synthetic":
         return _prepare_synthetic(run)
     from taichi_edges.detectors import DETECTORS, choose_detector
-    from taichi_edges.readers import READERS
     from taichi_edges.readers.frames import build_views, camera_poses, chosen_frames
+    from taichi_edges.readers.undistortion import undistorted_frames
 
     source = run.config.source
-    frames = chosen_frames(READERS[source.reader](run.data_path(source.path, "source.path"), source), source.skip)
-    if any(frames.lenses):
-        from taichi_edges.readers.undistortion import undistorted_frames
-
-        frames = undistorted_frames(frames, run.path("undistorted"))
+    frames = _listed_frames(run)
+    _pass_on(frames, run.progress)
+    frames = chosen_frames(frames, source.skip)
     camera_poses(frames)  # a mistake in them shall not wait for the detector
+    box, box_from = _scene_box(run.config, frames)
+    _refuse_missing_points(run, frames)
     detector = choose_detector(source, frames)
     _refuse_needless_calibration(run, detector)
+    frames = undistorted_frames(
+        frames, run.path("undistorted"), source.max_size, source.gamma, run.threads, run.progress
+    )
     frames, edge_maps, edgels = DETECTORS[detector](frames, run)
-    box = run.config.box if frames.box is None else frames.box
-    if any(frames.mask_paths):
-        from taichi_edges.detectors.drawing import draw_edge_maps
-        from taichi_edges.detectors.masks import within_masks
-        from taichi_edges.detectors.ridges import trace_ridges
+    views = _inside_the_run(run, build_views(frames, edge_maps, edgels, source, box, run.progress))
+    facts = _finish_views(run, views, frames)
+    own = [path for path in views.image_paths if path and not Path(path).is_absolute()]
+    points = _write_points(run, frames, box)
+    about_box = {"box": np.asarray(box, dtype=float).tolist(), "box_from": box_from}
+    return {"detector": detector, **about_box, **facts, "files": [*own, *facts["files"], *points]}
 
-        height, width = edge_maps.shape[1:]
-        if edgels is None:
-            edgels = trace_ridges(edge_maps, 4.0, source.thin_threshold, run.threads)
-        edgels = within_masks(edgels, frames.mask_paths, (width, height))
-        edge_maps = draw_edge_maps(edgels, height, width, run.threads)
-    views = build_views(frames, edge_maps, edgels, source, box, run.progress)
-    return {"detector": detector, **_finish_views(run, views)}
+
+def _listed_frames(run):
+    """What the reader found."""
+    from taichi_edges.readers import READERS
+
+    source = run.config.source
+    return READERS[source.reader](run.data_path(source.path, "source.path"), source)
+
+
+def _pass_on(frames, progress):
+    """Tell the user what the reader has to say."""
+    for note in frames.notes:
+        progress.say(note)
+    for warning in frames.warnings:
+        progress.warn(warning)
+
+
+def _scene_box(config, frames):
+    """(2, 3) corners of the scene, input units, and where they are from."""
+    if config.box != "auto":
+        return config.box, "scene"
+    if frames.box is not None:
+        return frames.box, "reader"
+    if frames.points is not None:
+        found = f"{len(frames.points)} points fit well enough to tell where the scene is"
+        raise UserError(f"{frames.where}: only {found}; set box, or raise source.max_point_error")
+    return UNIT_CUBE, "unit cube"
+
+
+def _refuse_missing_points(run, frames):
+    """UserError where the training is to start from points and there are none."""
+    if run.config.train.seeds == "points" and not run.config.source.points and not _has_points(frames):
+        problem = "train.seeds is 'points', but the model has none that fit"
+        raise UserError(f"{frames.where}: {problem}; set source.points or another train.seeds")
+
+
+def _has_points(frames):
+    return frames.points is not None and len(frames.points) > 0
+
+
+def _inside_the_run(run, views):
+    """The views with paths relative to the run's folder for pictures in it: it may be moved."""
+    folder = str(run.folder)
+    paths = (os.path.relpath(path, folder) if path and _lies_in(path, folder) else path for path in views.image_paths)
+    return replace(views, image_paths=tuple(paths))
+
+
+def _lies_in(path, folder):
+    return os.path.commonpath([os.path.abspath(path), os.path.abspath(folder)]) == os.path.abspath(folder)
 
 
 def _refuse_needless_calibration(run, detector):
@@ -68,20 +119,51 @@ def _refuse_needless_calibration(run, detector):
         raise UserError(f"{problem}; leave it out, or name ready maps in source.edges")
 
 
-def _finish_views(run, views):
-    """Trace and calibrate the edgels where the detector gave maps, write `views.npz` and the report; the facts."""
-    facts = {"views": len(views), "width_px": views.width, "height_px": views.height}
-    residuals = {}
-    if views.edgels is None:
+def _finish_views(run, views, frames=None):
+    """Trace and calibrate the edgels where the detector gave maps, write the views and the report; the facts.
+
+    frames: whose masks drop edgels; None where there are none.
+    """
+    from taichi_edges.evaluation.held_out import choose_held_out, split_views
+
+    facts, residuals = {"width_px": views.width, "height_px": views.height}, {}
+    traced_here = views.edgels is None
+    if traced_here:
         views, width = _traced(run, views)
         facts["line_width_px"] = round(width, 2)
+    if frames is not None:
+        views, dropped = _masked(run, views, frames, redraw=not traced_here)
+        facts |= {} if dropped is None else {"masked_edgels": dropped}
+    views, held_out = split_views(views, choose_held_out(views.names, run.config.evaluation.held_out))
+    facts = {"views": len(views), "held_out": list(held_out.names), **facts}
+    if traced_here:
         views, calibration = _calibrated(run, views)
         if calibration is not None:
+            held_out = _corrected(run, held_out, calibration)
             facts["calibration"] = calibration.facts()
             residuals = {"residuals": calibration.residuals, "on_silhouette": calibration.on_silhouette}
     facts["edgels"] = len(views.edgels)
     write_views(run.path("views.npz"), views)
-    return {**facts, "files": [_write_sheet(run, views, residuals), *_copy_points(run)]}
+    write_views(run.path("held_out.npz"), held_out)
+    return {**facts, "files": [_write_sheet(run, views, residuals)]}
+
+
+def _masked(run, views, frames, redraw):
+    """The views without the edgels that their masks drop, and how many those are; None without masks.
+
+    redraw: the maps are drawn through the edgels; else they are black where masks are, and drawn anew later, or not.
+    """
+    from taichi_edges.detectors.drawing import draw_edge_maps
+    from taichi_edges.detectors.masks import blank_outside, has_areas, within_masks
+
+    if not has_areas(frames):
+        return views, None
+    kept = within_masks(views.edgels, frames, (views.width, views.height), run.progress)
+    if redraw:
+        maps = draw_edge_maps(kept, views.height, views.width, run.threads)
+    else:
+        maps = blank_outside(views.edge_maps, frames)
+    return replace(views, edgels=kept, edge_maps=maps), len(views.edgels) - len(kept)
 
 
 def _detected_in_pictures(run, views):
@@ -156,6 +238,18 @@ def _calibrate(run, views, thin):
     )
 
 
+def _corrected(run, views, calibration):
+    """Views that the calibration has not seen, their edgels without the biases that it found in others."""
+    from taichi_edges.detectors.calibration import sides_of
+
+    if not len(views) or not (calibration.shift_applied or calibration.silhouette_applied):
+        return views
+    silhouette, shift = calibration.silhouette_applied * calibration.silhouette, calibration.shift
+    values = np.array([silhouette, *(calibration.shift_applied * shift)])
+    sides = sides_of(with_whole_paths(run, views), views.edgels, run.threads)
+    return replace(views, edgels=sides.correct(views.edgels, values)[0])
+
+
 def _write_sheet(run, views, residuals):
     """The picture of what the detector gave; its name."""
     from taichi_edges.exporters.detection_sheet import write_detection_sheet
@@ -164,15 +258,21 @@ def _write_sheet(run, views, residuals):
     return "detection.png"
 
 
-def _copy_points(run):
-    """The points the scene names, those inside the box, to `seeds.ply`. Returns the names of the files written."""
-    if not run.config.source.points:
+def _write_points(run, frames, box):
+    """The points the scene or the layout has, those inside the box, to `seeds.ply`. Returns the files written.
+
+    box: (2, 3) corners, input units.
+    """
+    from taichi_edges.exporters.ply import write_float_vertices
+    from taichi_edges.readers.points import inside_box, read_points
+
+    if run.config.source.points:
+        points = read_points(run.data_path(run.config.source.points, "source.points"), box)
+    else:
+        points = inside_box(frames.points, box) if frames is not None and _has_points(frames) else []
+    if len(points) == 0:
         run.path("seeds.ply").unlink(missing_ok=True)  # of an older run with other settings
         return []
-    from taichi_edges.exporters.ply import write_float_vertices
-    from taichi_edges.readers.points import read_points
-
-    points = read_points(run.data_path(run.config.source.points, "source.points"), run.config.box)
     write_float_vertices(run.path("seeds.ply"), ("x", "y", "z"), points)
     return ["seeds.ply"]
 
@@ -204,7 +304,8 @@ def _prepare_synthetic(run):
         views = _detected_in_pictures(run, views)
     write_edges(run.path("truth.json"), part.edges, {"part": part.name})
     facts = _finish_views(run, views)
-    return {"part": part.name, **facts, "files": ["truth.json", *files, *facts["files"]]}
+    points = _write_points(run, None, UNIT_CUBE)
+    return {"part": part.name, **facts, "files": ["truth.json", *files, *facts["files"], *points]}
 
 
 def train(run):
@@ -246,10 +347,11 @@ def _start(run, views, generator):
         voted = voted_gaussians(views, config.edge_threshold, config.gaussians, config.initial_opacity, generator)
         if voted is not None:
             return voted
-        seeds, instead = ("points", "source.points") if run.config.source.points else ("random", "random points")
+        seeds = "points" if run.path("seeds.ply").is_file() else "random"
+        instead = {"points": "the given points", "random": "random points"}[seeds]
         found = f"the views agree on an edge in fewer than {LEAST_VOTED} places"
         run.progress.warn(f"{found}; the training starts from {instead} instead")
-    if seeds == "points":
+    if seeds == "points" or (seeds == "auto" and run.path("seeds.ply").is_file()):
         given = stack_fields(read_vertices(run.path("seeds.ply"), ("x", "y", "z")), ("x", "y", "z"))
         points = given_points(views.similarity.to_unit(given.astype(np.float64)), config.gaussians, generator)
     else:
@@ -258,8 +360,8 @@ def _start(run, views, generator):
 
 
 def seed_files(run):
-    """The points that training starts from, where the scene names some."""
-    return [run.path("seeds.ply")] if run.config.source.points else []
+    """The points that training may start from, where the scene or the layout has some."""
+    return [run.path("seeds.ply")]
 
 
 def _write_csv(path, rows):
@@ -360,21 +462,25 @@ def truth_path(run):
 def evaluate(run):
     """`edges.json` -> `metrics.json` and `metrics.csv`: EMAP's protocol, corners, free ends; without a truth fewer.
 
-    Lengths are in the frame of the truth, in the unit cube where there is none.
+    And what the held-out views say. Lengths are in the frame of the truth, in the unit cube where there is none.
     """
     from taichi_edges.evaluation.ground_truth import read_ground_truth
+    from taichi_edges.evaluation.held_out import held_out_metrics
     from taichi_edges.evaluation.metrics import evaluate as measure
-    from taichi_edges.evaluation.metrics import measure_alone
+    from taichi_edges.evaluation.metrics import exact_polylines, measure_alone
 
     edges, _ = read_edges(run.path("edges.json"))
     views, path = read_views(run.path("views.npz")), truth_path(run)
+    unit = edges.transformed(views.similarity.to_unit)
     if path is None:
-        metrics = {**measure_alone(edges.transformed(views.similarity.to_unit)), "ground_truth": None}
+        metrics, source = measure_alone(unit), None
     else:
         to_truth, from_truth = views.input_to_truth, np.linalg.inv(views.input_to_truth)
         truth = read_ground_truth(path, lambda points: views.similarity.to_unit(transform(from_truth, points)))
         into_frame = partial(transform, to_truth) if truth.own_frame else views.similarity.to_unit
-        metrics = {**measure(edges.transformed(into_frame), truth), "ground_truth": truth.source}
+        metrics, source = measure(edges.transformed(into_frame), truth), truth.source
+    metrics |= held_out_metrics(exact_polylines(unit), views, read_views(run.path("held_out.npz")))
+    metrics["ground_truth"] = source
     write_json(run.path("metrics.json"), metrics)
     _write_csv(run.path("metrics.csv"), [("metric", "value"), *metrics.items()])
     return metrics
@@ -408,10 +514,7 @@ def picture_files(run):
     source = run.config.source
     if source.reader == "synthetic":
         return []
-    from taichi_edges.readers import READERS
-
-    frames = READERS[source.reader](run.data_path(source.path, "source.path"), source)
-    return [Path(path) for path in frames.image_paths if Path(path).is_file()]
+    return [Path(path) for path in _listed_frames(run).image_paths if path and Path(path).is_file()]
 
 
 def source_files(run):
@@ -421,11 +524,10 @@ def source_files(run):
     models = [_model_file(run)] if source.detector == "onnx" else []
     if source.reader == "synthetic":
         return [*points, *models]
-    from taichi_edges.readers import READERS
-
-    frames = READERS[source.reader](run.data_path(source.path, "source.path"), source)
-    paths = [Path(path) for path in (*frames.edge_paths, *frames.image_paths) if path]
-    return [frames.where, *sorted({path for path in paths if path.is_file()}), *points, *models]
+    frames = _listed_frames(run)
+    paths = {Path(path) for path in (*frames.edge_paths, *frames.image_paths, *frames.mask_paths) if path}
+    own = dict.fromkeys(path for path in (frames.where, *frames.files) if path.is_file())
+    return [*own, *sorted(path for path in paths if path.is_file()), *points, *models]
 
 
 def _model_file(run):
