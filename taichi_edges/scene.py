@@ -76,6 +76,10 @@ class SourceConfig(Section):
     points: str = Field("", description="point cloud to start from with train.seeds: points; relative to the data root")
     thin: bool = Field(True, description="reduce the lines of the edge maps to their ridges and redraw them thin")
     thin_threshold: Share = Field(0.3, description="of full scale; ridges of the edge maps below are dropped")
+    min_chain: Annotated[int, Field(ge=0)] = Field(
+        0, description="px; edgels on shorter chains are taken for texture, longer ones tell directions; 0: all count"
+    )
+    tolerance_px: Positive = Field(0.5, description="by which edgels may be off, detector and poses together, px")
     skip: list[str] = Field([], description="names of views to leave out")
     part: str = Field("demo", description="synthetic: which of the generator's parts")
     views: Count = Field(30, description="synthetic: number of views")
@@ -155,7 +159,7 @@ class TrainConfig(Section):
         0.0, description="stop when the last two passes lowered the loss by no more than this share each; 0: never"
     )
     gaussians: Count = Field(10_000, description="number of random points to start from")
-    seeds: Literal["auto", "random", "points", "votes"] = Field(
+    seeds: Literal["auto", "random", "points", "votes", "sweep"] = Field(
         "auto",
         description="random points in the box; points: source.points or the model's; votes: where many views agree on"
         " an edge; auto: points if there are any, else random",
@@ -209,14 +213,19 @@ class FilterConfig(Section):
         0.05, description="share of the views that see a point and have an edge pixel (refine: edgel) of its own there"
     )
     refine: bool = Field(False, description="move points to where the viewing planes of their edgels meet")
+    min_views: Positive = Field(3.0, description="refine: views that must show an edge, each counted by its strength")
     min_steadiness: Share = Field(
         0.54, description="refine: share of the unexplained edgels near a point that lie on it, relative to sure edges"
     )
     min_evidence: NotNegative = Field(
-        0.7, description="refine: that an edge is no passing contour, log likelihood ratio from its views"
+        0.7, description="refine: that an edge is no passing contour, log likelihood ratio from its views; 0: not tested"
+    )
+    min_angle: Annotated[float, Field(ge=0, le=90)] = Field(
+        15.0, description="refine: an edge that few views see is seen from directions so far from their mean, degrees"
     )
     harvest: bool = Field(True, description="refine: look once more for edges seen in few views")
     grow: Share = Field(0.2, description="refine: continue edges where this share of the views agrees; 0: do not")
+    grow_step: Positive = Field(1.0, description="refine: of growing, pixels at the scene")
     outlier_neighbors: Annotated[int, Field(ge=0)] = Field(3, description="statistical outliers: neighbours; 0: off")
     outlier_deviations: Positive = Field(5.0, description="mean neighbour distance allowed, standard deviations")
 
@@ -242,6 +251,10 @@ class RefineConfig(Section):
     """From single edges to a connected wireframe that agrees with the images (beyond the paper)."""
 
     enabled: bool = Field(False, description="false: the edges stay as they were fitted")
+    min_views: Positive = Field(2.5, description="views that must show an edge, each counted by its strength")
+    min_steadiness: Share = Field(
+        0.66, description="share of the edgels about an edge that lie on it; contours have half"
+    )
     regularise: bool = Field(
         False, description="make edges parallel, perpendicular, coplanar, coaxial, of equal radius, if images allow"
     )
@@ -378,8 +391,23 @@ PRESETS = {
 LARGE_IN_THE_PAPER = {  # supplement: "for large scenes" lambda_1 = lambda_2 = 0.01, k = 4 as ever, seeded by SfM points
     "train": {"seeds": "auto", "orient_weight": 0.01, "shape_weight": 0.01},
 }
+# Photographs of what surrounds the camera: much texture, poses from structure from motion, few views of every place.
+PHOTOGRAPHED = {
+    "source": {"min_chain": 12, "tolerance_px": 0.7},
+    "train": {"seeds": "sweep", "gaussians": 60_000, "steps": 200, "learning_rates": {"means": 1e-4}},
+    "filter": {
+        "min_views": 2.2,
+        "min_steadiness": 0.0,
+        "min_evidence": 0.0,
+        "min_angle": 0.0,
+        "harvest": False,
+        "grow": 0.0,
+        "grow_step": 3.0,
+    },
+    "refine": {"min_views": 2.0, "min_steadiness": 0.3},
+}
 SCALES = {
     "object": {"paper": {}, "fast": {}},
-    "building": {"paper": LARGE_IN_THE_PAPER, "fast": {}},
-    "room": {"paper": LARGE_IN_THE_PAPER, "fast": {}},
+    "building": {"paper": LARGE_IN_THE_PAPER, "fast": PHOTOGRAPHED},
+    "room": {"paper": LARGE_IN_THE_PAPER, "fast": PHOTOGRAPHED},
 }

@@ -142,10 +142,27 @@ def _finish_views(run, views, frames=None):
             held_out = _corrected(run, held_out, calibration)
             facts["calibration"] = calibration.facts()
             residuals = {"residuals": calibration.residuals, "on_silhouette": calibration.on_silhouette}
+    if run.config.source.min_chain:
+        views = _chained(run, views)
     facts["edgels"] = len(views.edgels)
     write_views(run.path("views.npz"), views)
     write_views(run.path("held_out.npz"), held_out)
     return {**facts, "files": [_write_sheet(run, views, residuals)]}
+
+
+def _chained(run, views):
+    """The views with the edgels on long chains, and maps drawn through these."""
+    from taichi_edges.detectors.chains import with_long_chains
+    from taichi_edges.detectors.drawing import draw_edge_maps
+    from taichi_edges.kernels.device import start_taichi
+
+    start_taichi("cpu", run.threads, run.config.seed, run.kernel_cache)
+    edgels = with_long_chains(views.edgels, run.config.source.min_chain, views.height, views.width)
+    if len(edgels) == 0:
+        problem = f"no edge is {run.config.source.min_chain} px long in any of {len(views)} views"
+        raise UserError(f"source.min_chain: {problem}; lower it, or look at detection.png of a run with 0")
+    maps = draw_edge_maps(edgels, views.height, views.width, run.threads)
+    return replace(views, edgels=edgels, edge_maps=maps)
 
 
 def _masked(run, views, frames, redraw):
@@ -340,13 +357,17 @@ def _start(run, views, generator):
     from taichi_edges.exporters.ply import read_vertices, stack_fields
     from taichi_edges.splatting.gaussians import start_gaussians
     from taichi_edges.splatting.seeding import LEAST_VOTED, given_points, random_points, voted_gaussians
+    from taichi_edges.splatting.sweeping import swept_gaussians
 
     config = run.config.train
     seeds = config.seeds
-    if seeds == "votes":
-        voted = voted_gaussians(views, config.edge_threshold, config.gaussians, config.initial_opacity, generator)
-        if voted is not None:
-            return voted
+    if seeds in ("votes", "sweep"):
+        if seeds == "votes":
+            found = voted_gaussians(views, config.edge_threshold, config.gaussians, config.initial_opacity, generator)
+        else:
+            found = swept_gaussians(views, config.gaussians, config.initial_opacity, generator, run.progress)
+        if found is not None:
+            return found
         seeds = "points" if run.path("seeds.ply").is_file() else "random"
         instead = {"points": "the given points", "random": "random points"}[seeds]
         found = f"the views agree on an edge in fewer than {LEAST_VOTED} places"
@@ -374,7 +395,7 @@ def cluster(run):
     """`gaussians.ply`, `views.npz` -> `points.ply` (filtered oriented points, input frame) and `clusters.npz`."""
     from taichi_edges.edges.assembly import assemble
     from taichi_edges.edges.contours import without_contours
-    from taichi_edges.edges.filtering import FEW_VIEWS, LEAST_VIEWS, filter_points
+    from taichi_edges.edges.filtering import FEW_VIEWS, filter_points
     from taichi_edges.exporters.point_cloud import write_oriented_points
     from taichi_edges.exporters.splats import read_gaussians
     from taichi_edges.kernels.device import is_running, start_taichi
@@ -392,12 +413,12 @@ def cluster(run):
     if len(points) == 0:
         problem = f"none of {len(means)} Gaussians passed the filters ({_in_words(asdict(counts))})"
         cure = "train longer, or lower filter.min_opacity or filter.min_support"
-        if run.config.filter.refine and len(views) < FEW_VIEWS:
-            seen = f"an edge must be seen in {LEAST_VIEWS:g} views at full strength"
+        if run.config.filter.refine and len(views) < FEW_VIEWS * run.config.filter.min_views:
+            seen = f"an edge must be seen in {run.config.filter.min_views:g} views at full strength"
             cure = f"{len(views)} views are too few, {seen}: take more, or set filter.refine: false"
         raise UserError(f"{run.path('gaussians.ply')}: {problem}; {cure}")
     found = assemble(points, directions, run.config.cluster)
-    found, contours = without_contours(found, points, directions, explained, views, run.config.filter.min_evidence)
+    found, contours = without_contours(found, points, directions, explained, views, run.config.filter)
     labels = found.labels
     write_oriented_points(run.path("points.ply"), views.similarity.to_input(points), directions, labels)
     with replacing(run.path("clusters.npz")) as unfinished, open(unfinished, "wb") as file:

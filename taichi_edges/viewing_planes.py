@@ -10,7 +10,6 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 RADII_PX = (3.0, 2.0, 1.5, 1.2, 1.0, 1.0)  # of the edgels that are looked at, round by round
-SCALE_PX = 0.5  # residual at which an edgel's weight has fallen to a quarter
 LEAST_SPREAD = 0.02  # planes that lean against each other less (squared sine) say nothing across their common side
 LINE_SPREAD = 0.25  # the planes' third eigenvalue over the second, below which they have a direction in common
 
@@ -52,11 +51,11 @@ def refine_points(matching, points, directions, radii=RADII_PX):
     """
     points, directions = np.array(points, np.float64), np.array(directions, np.float64)
     for radius in radii:
-        equations = matching.equations(points, directions, radius, SCALE_PX)
+        equations = matching.equations(points, directions, radius, matching.scale_px)
         steps, directions = _solve(equations.astype(np.float64), directions)
         lengths = np.linalg.norm(steps, axis=1, keepdims=True)
         points += steps * np.minimum(1.0, radius * matching.pixel / np.maximum(lengths, 1e-300))
-    equations = matching.equations(points, directions, radii[-1], SCALE_PX).astype(np.float64)
+    equations = matching.equations(points, directions, radii[-1], matching.scale_px).astype(np.float64)
     weight, seen = equations[:, 9], np.maximum(equations[:, 10], 1.0)
     values, _ = _principal_axes(equations)
     spread = np.maximum(values[:, 1], 0.0) / np.maximum(values[:, 2], 1e-12)

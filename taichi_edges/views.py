@@ -25,6 +25,8 @@ class Views:
     similarity:       input frame -> unit cube.
     box:              (2, 3) the scene box in the unit cube.
     input_to_truth:   (4, 4) input frame -> frame of the ground truth (EMAP's `worldtogt`).
+    pixel:            size of a pixel at what is in sight, unit-cube units; None: at the middle of the scene box.
+    tolerance_px:     residual at which an edgel's weight has fallen to a quarter: by so much detector and poses err.
     edgels:           Edgels, the sub-pixel points through which the edge maps are drawn; None before they are traced.
     """
 
@@ -37,6 +39,8 @@ class Views:
     box: np.ndarray = field(default_factory=lambda: np.array([[0.0, 0, 0], [1, 1, 1]]))
     input_to_truth: np.ndarray = field(default_factory=lambda: np.eye(4))
     edgels: Edgels | None = None
+    pixel: float | None = None
+    tolerance_px: float = 0.5
 
     def __post_init__(self):
         count, height, width = self.edge_maps.shape
@@ -64,7 +68,9 @@ class Views:
 
 
 def pixel_size(views):
-    """Size of a pixel at the middle of the scene box, unit-cube units: median over the views."""
+    """Size of a pixel at the scene, unit-cube units: `Views.pixel`, or else at the middle of the box."""
+    if views.pixel is not None:
+        return views.pixel
     forward, offset = views.world_to_camera[:, 2, :3], views.world_to_camera[:, 2, 3]
     depths = forward @ views.box.mean(axis=0) + offset
     in_front = np.maximum(depths, NEAR)  # a view that looks away says nothing about the scale
@@ -85,6 +91,8 @@ def write_views(path, views):
             similarity_offset=np.array(views.similarity.offset),
             box=views.box,
             input_to_truth=views.input_to_truth,
+            pixel=np.nan if views.pixel is None else views.pixel,
+            tolerance_px=views.tolerance_px,
             **{f"edgel_{name}": getattr(views.edgels, name) for name in EDGEL_ARRAYS if views.edgels is not None},
         )
     return path
@@ -108,6 +116,8 @@ def _views_of(path, _state):
             box=archive["box"],
             input_to_truth=archive["input_to_truth"],
             edgels=_edgels_of(archive),
+            pixel=None if np.isnan(archive["pixel"]) else float(archive["pixel"]),
+            tolerance_px=float(archive["tolerance_px"]),
         )
     arrays = [views.edge_maps, views.intrinsics, views.world_to_camera, views.box, views.input_to_truth]
     arrays += [getattr(views.edgels, name) for name in EDGEL_ARRAYS if views.edgels is not None]

@@ -1,5 +1,7 @@
 """Chains of edgels: what is connected in a view, and how long it is. Texture is short; edges are long."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -7,6 +9,9 @@ from scipy.spatial import cKDTree
 
 LINK_PX = 1.6  # between edgels beside each other on a chain; they are about 1 px apart
 LINK_COSINE = np.cos(np.radians(25.0))  # between their normals
+SURE_PX = (
+    8.0  # edgels beside each other that say as much as one alone: they share noise, and half of them is there by chance
+)
 BESIDE_PX = 0.7  # by which the next edgel may be off the line of the one before
 
 
@@ -39,3 +44,17 @@ def chain_lengths(edgels):
     """(e,) number of edgels on the chain of each edgel: its length in pixels, roughly."""
     labels = chain_labels(edgels)
     return np.bincount(labels)[labels] if len(labels) else np.zeros(0, np.int64)
+
+
+def with_long_chains(edgels, least, height, width):
+    """Edgels on chains of at least `least` px, with the chain's say in how sure they are, and how they run.
+
+    An edgel is as sure as the edgels of a whole edge together, and its normal is the edge's there.
+    ti.init must have been called.
+    """
+    from taichi_edges.kernels.smoothing import with_smooth_normals
+
+    edgels = with_smooth_normals(edgels, height, width)
+    lengths = chain_lengths(edgels)
+    doubt = (1.0 - edgels.strengths) ** (lengths / SURE_PX)
+    return replace(edgels, strengths=(1.0 - doubt).astype(np.float32)).keep(lengths >= least)

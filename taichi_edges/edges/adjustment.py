@@ -23,7 +23,6 @@ from scipy.sparse.linalg import spsolve
 
 from taichi_edges.edges.charts import derivatives, moved, nearest_parameters, neighbors, own_unknowns
 from taichi_edges.edges.evidence import SPACING_PX, support_of
-from taichi_edges.viewing_planes import SCALE_PX
 from taichi_edges.wireframe import Wireframe
 
 RADII_PX = (3.0, 2.0, 1.5, 1.0, 1.0)  # of the edgels that are looked at, round by round
@@ -162,7 +161,8 @@ def image_equations(problem, wireframe, matching, radius):
     support = support_of(matching, shapes, radius)
     samples = support.samples
     noise = max(support.noise_px, LEAST_NOISE_PX)
-    scale = SCALE_PX if radius > TIGHT_RADIUS_PX else min(SCALE_PX, SCALE_NOISES * noise)
+    widest = matching.scale_px
+    scale = widest if radius > TIGHT_RADIUS_PX else min(widest, SCALE_NOISES * noise)
     said = matching.equations_of(samples.points, support.edgels, scale).astype(np.float64)
     counted = _counted(wireframe, samples, pixel) * support.certainty  # what agrees by chance says nothing
     said *= (counted * SPACING_PX / CORRELATED_PX / noise**2)[:, None]

@@ -8,7 +8,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from taichi_edges.edges.evidence import claims_of, support_along
-from taichi_edges.edges.growing import LEAST_VIEWS
 from taichi_edges.edges.model_selection import distances_to
 from taichi_edges.shapes import Line, bounds_of, near_bounds
 from taichi_edges.wireframe import Edge, Wireframe
@@ -16,7 +15,7 @@ from taichi_edges.wireframe import Edge, Wireframe
 LONGEST_PX = 60.0  # a longer edge has points of its own
 SHORTEST_PX = 4.0
 CLEAR_PX = 2.0  # next to a vertex the edgels are those of the others
-SHOWN = 0.9  # of the places between, in LEAST_VIEWS views
+SHOWN = 0.9  # of the places between, in enough views
 ON_PX, ABOUT_PX = 0.5, 3.0  # from a line: on it, about it
 STEADY = 0.6  # a contour that passes by at random lies on the line a sixth of the time
 MOST_PAIRS = 20_000  # the nearest ones, so that a large scene does not take long
@@ -32,7 +31,7 @@ def completed(wireframe, matching):
         line = Line(wireframe.vertices[[first, second]])
         places = clear_places(line, matching.pixel)
         views = support_along(matching, line, places, claims)
-        if (views >= LEAST_VIEWS).mean() >= SHOWN and steadiness(matching, line, places, claims) >= STEADY:
+        if (views >= matching.least_views).mean() >= SHOWN and steadiness(matching, line, places, claims) >= STEADY:
             found.append((float(views.mean()), first, second))
     edges = list(wireframe.edges)
     for _, first, second in sorted(found, reverse=True):

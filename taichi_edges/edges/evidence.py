@@ -10,10 +10,8 @@ from functools import cached_property
 import numpy as np
 from scipy.special import gammainc
 
-from taichi_edges.edges.growing import LEAST_VIEWS
 from taichi_edges.explaining import BEST_SUPPORTED, NOISE_PER_MEDIAN, TIGHT_NOISES, TIGHT_PX
 from taichi_edges.kernels.edgel_matching import MOST_SINE
-from taichi_edges.viewing_planes import SCALE_PX
 from taichi_edges.wireframe import Evidence
 
 SPACING_PX = 0.5  # of the samples of an edge; edgels are about 1 px apart, so that hardly one of them is missed
@@ -115,8 +113,8 @@ class Support:
     """The edgels of all views that are matched by the samples of some edges and owned by these.
 
     samples: Samples. edgels: (n, V) index, -1 where there is none. residuals: (n, V) px. weights: (n, V) strength of
-    the edgel times closeness, that of Geman and McClure at SCALE_PX; 0 where there is none. claims: Claims. chance:
-    sum of the weights that a place would have by chance.
+    the edgel times closeness, that of Geman and McClure at the scale of the matching; 0 where there is none. claims: Claims. chance:
+    sum of the weights that a place would have by chance. least_views: that must show an edge, each counted by its weight.
     """
 
     samples: Samples
@@ -125,6 +123,7 @@ class Support:
     weights: np.ndarray
     claims: Claims
     chance: float
+    least_views: float
 
     @cached_property
     def views(self):
@@ -158,8 +157,8 @@ class Support:
 
     @cached_property
     def supported_lengths(self):
-        """(E,) length that LEAST_VIEWS views see, each counted by its weight."""
-        return self.samples.sums(self.samples.lengths * (self.views >= LEAST_VIEWS))
+        """(E,) length that `least_views` see, each counted by its weight."""
+        return self.samples.sums(self.samples.lengths * (self.views >= self.least_views))
 
     @cached_property
     def residual_px(self):
@@ -191,7 +190,7 @@ def _owned(matching, samples, edgels, residuals, handicaps):
     lost, edgels = claims.owners[found] != edges, edgels.copy()
     edgels[at[lost], view[lost]] = -1
     weights = _weights(matching, edgels, residuals)
-    return Support(samples, edgels, residuals, weights, claims, chance_weight(matching))
+    return Support(samples, edgels, residuals, weights, claims, chance_weight(matching), matching.least_views)
 
 
 def evidence_of(support):
@@ -250,7 +249,7 @@ def chance_weight(matching):
     From how densely the edgels fill the part of each image where there are any, a pixel of an edge each.
     """
     total, edgels = 0.0, matching.edgels
-    width = 0.5 * np.pi * SCALE_PX  # integral of Geman and McClure's weight over the distance
+    width = 0.5 * np.pi * matching.scale_px  # integral of Geman and McClure's weight over the distance
     turned = 2 * np.arcsin(MOST_SINE) / np.pi  # share of the directions that an edgel agrees with
     for view in range(edgels.view_count):
         points, _, strengths = edgels.of_view(view)
@@ -270,4 +269,4 @@ def _matches(matching, points, directions, radius):
 def _weights(matching, edgels, residuals):
     """(n, V) strength times closeness of matched edgels, 0 where there is none."""
     strengths = np.append(matching.edgels.strengths, np.float32(0))[edgels]
-    return strengths / (1.0 + (residuals / SCALE_PX) ** 2) ** 2
+    return strengths / (1.0 + (residuals / matching.scale_px) ** 2) ** 2

@@ -13,10 +13,10 @@ from scipy.spatial import cKDTree
 from taichi_edges.support import exclusive_support
 
 AROUND = 9  # points, itself included, over which the steadiness of a point is a median
-LEAST_VIEWS = 3.0  # of full strength; two planes always meet, and a third one is there by chance too easily
-# An edge that fewer views see must be seen from different directions, 15 degrees apart from their mean: neighbouring
+CONTINUED = 0.5  # views that may be fewer where an edge goes on
+# An edge that fewer views see than so many times the least must be seen from different directions, 15 degrees apart from their mean: neighbouring
 # views see an occluding contour in one place as well.
-FEW_VIEWS, FEW_SPREAD = 6.0, np.sin(np.radians(15.0)) ** 2
+FEW_VIEWS = 2.0
 RARE = 0.8  # of a harvested point's support, which those that continue it need
 HARVEST_KEEP = 0.06  # share of the views that must see one of the edges left over
 
@@ -81,7 +81,7 @@ def refined_points(points, directions, views, config, edge_threshold, generator)
     from taichi_edges.kernels.edgel_matching import EdgelMatching
     from taichi_edges.viewing_planes import refine_points
 
-    matching = EdgelMatching(views)
+    matching = EdgelMatching(views, config.min_views - CONTINUED)
     found = refine_points(matching, points, directions)
     supported, steady, _ = judge(matching, found, config)
     refined, sizes = found.keep(steady), [len(found), supported.sum(), steady.sum()]
@@ -91,7 +91,7 @@ def refined_points(points, directions, views, config, edge_threshold, generator)
     if config.grow:
         least = np.full(len(refined), config.grow)
         least[sizes[2] :] = np.minimum(config.grow, RARE * refined.support[sizes[2] :])  # what was harvested is rare
-        refined = grow_points(matching, refined, least)
+        refined = grow_points(matching, refined, least, config.grow_step)
     supported, steady, explained = judge(matching, refined, config)
     sizes += [len(refined), supported.sum(), steady.sum()]
     weak, unsteady, harvested, grown, weak_later, unsteady_later = np.abs(np.diff(sizes)).tolist()
@@ -111,8 +111,8 @@ def judge(matching, refined, config):
     from taichi_edges.explaining import explain
 
     explained = explain(matching, refined)
-    apart = (refined.views >= FEW_VIEWS) | (refined.spread >= FEW_SPREAD)
-    supported = (explained.support >= config.min_support) & (refined.views >= LEAST_VIEWS) & apart
+    apart = (refined.views >= FEW_VIEWS * config.min_views) | (refined.spread >= np.sin(np.radians(config.min_angle)) ** 2)
+    supported = (explained.support >= config.min_support) & (refined.views >= config.min_views) & apart
     steady, places = supported.copy(), refined.points[supported]
     if len(places):
         around = cKDTree(places).query(places, min(AROUND, len(places)))[1].reshape(len(places), -1)
@@ -132,7 +132,7 @@ def harvest(matching, refined, views, config, edge_threshold, generator):
     left = views.edgels.keep(unexplained(matching, refined))
     left = replace(views, edgels=left, edge_maps=draw_edge_maps(left, views.height, views.width))
     seeds = vote_seeds(left, edge_threshold, generator, keep=HARVEST_KEEP)
-    matching = EdgelMatching(left)
+    matching = EdgelMatching(left, matching.least_views)
     found = refine_points(matching, seeds.points, seeds.directions)
     steady = judge(matching, found, config)[1]
     return found.keep(steady)

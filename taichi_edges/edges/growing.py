@@ -8,21 +8,19 @@ from scipy.spatial import cKDTree
 
 from taichi_edges.viewing_planes import refine_points
 
-STEP_PX = 1.0  # of a step along the tangent
 RADII_PX = (1.5, 1.0, 1.0)  # of the refinement of a step
 COVERED, TOO_CLOSE = 0.6, 0.5  # steps; no proposal is made, and no point kept, so near to one that is there
 STRAYED = 0.7  # steps; a point that the refinement moves farther has jumped to something else
 LEAST_COSINE = 0.8  # between the directions before and after a step
-LEAST_VIEWS = 2.5  # of full strength; two planes always meet
 MOST_ROUNDS = 200
 
 
-def grow_points(matching, refined, least):
+def grow_points(matching, refined, least, step_px=1.0):
     """RefinedPoints and the points that continue them, each the step after another.
 
-    matching: EdgelMatching. least: (n,) share of the views that the points which continue each of them need.
+    matching: EdgelMatching. least: (n,) share of the views that the points which continue each of them need. step_px: of a step.
     """
-    step, newest = STEP_PX * matching.pixel, refined
+    step, newest = step_px * matching.pixel, refined
     for _ in range(MOST_ROUNDS):
         if len(newest) == 0:
             break
@@ -40,7 +38,7 @@ def _next_points(matching, newest, tree, step, least):
     before = free % len(newest)
     ahead, directions, least = ahead[free], newest.directions[before], least[before]
     found = refine_points(matching, ahead, directions, RADII_PX)
-    good = (found.support >= least) & (found.views >= LEAST_VIEWS)
+    good = (found.support >= least) & (found.views >= matching.least_views)
     good &= np.linalg.norm(found.points - ahead, axis=1) <= STRAYED * step
     good &= np.abs((found.directions * directions).sum(axis=1)) >= LEAST_COSINE
     good[good] = tree.query(found.points[good])[0] > TOO_CLOSE * step

@@ -21,8 +21,7 @@ LEAST_LENGTH_PX = 0.1  # of a stroke; a shorter one has no direction
 WIDE_GAP_PX = 24.0  # between strokes that continue each other, where their ends are still free after the first pass
 MOST_COMPARED = 150  # edges whose relations are counted where nobody asked for them: there are as many as its square
 LEAST_CONFIDENCE = 0.2  # of an edge, see `evidence.evidence_of`
-LEAST_STEADY = 0.66  # share of the edgels about an edge that lie on it; contours have half
-LENIENT = 0.75  # of that, for edges that have not been adjusted
+LENIENT = 0.75  # of the steadiness, for edges that have not been adjusted
 LEAST_SUPPORTED = 0.33  # of the length of an edge; where edges touch, only one of them owns the edgels
 
 
@@ -50,18 +49,18 @@ def refine_wireframe(loose, views, config):
     """
     if not config.enabled or not len(loose):
         return loose, RefineCounts()
-    matching = EdgelMatching(views)
+    matching = EdgelMatching(views, config.min_views)
     strokes = [shape for shape in loose.shapes if shape.length >= LEAST_LENGTH_PX * matching.pixel]
-    shapes, merging, unsupported = whole_edges(strokes, matching)
+    shapes, merging, unsupported = whole_edges(strokes, matching, config.min_steadiness)
     wireframe, lines = completed(connected(shapes, matching.pixel), matching)
     wireframe, relations = related(adjusted(wireframe, matching), matching, config.regularise)
-    judged = with_evidence(wireframe, matching)
+    judged = with_evidence(wireframe, matching, config.min_steadiness)
     unsupported += len(wireframe) - len(judged)
     counts = RefineCounts(**asdict(merging), lines=lines, unsupported=unsupported, relations=relations)
     return judged, counts
 
 
-def whole_edges(shapes, matching):
+def whole_edges(shapes, matching, steady):
     """The shapes of whole edges from those of strokes, Merging, and how many were left out for lack of support.
 
     Free ends are extended only when it is known which are free, and then some more strokes continue each other.
@@ -69,9 +68,9 @@ def whole_edges(shapes, matching):
     pixel, seen = matching.pixel, partial(support_along, matching)
     yardstick = yardstick_of(shapes, matching)
     shapes, first = continued(shapes, yardstick, pixel, seen)
-    kept = with_support(matching, shapes)
+    kept = with_support(matching, shapes, steady)
     longer, second = continued(with_longer_ends(matching, kept), yardstick, pixel, seen, WIDE_GAP_PX)
-    found = with_support(matching, longer)
+    found = with_support(matching, longer, steady)
     merging = Merging(*(sum(pair) for pair in zip(astuple(first), astuple(second), strict=True)))
     return found, merging, len(shapes) - len(kept) + len(longer) - len(found)
 
@@ -91,18 +90,18 @@ def related(wireframe, matching, impose):
     return wireframe, {kind: (count, 0) for kind, count in found_relations(wireframe, matching)[0].items()}
 
 
-def with_evidence(wireframe, matching):
+def with_evidence(wireframe, matching, steady):
     """The Wireframe with what the images say about each edge, and without those they do not support."""
     support = support_of(matching, wireframe.shapes)
     found = evidence_of(support)
     edges = tuple(replace(edge, evidence=of) for edge, of in zip(wireframe.edges, found, strict=True))
     sure = np.array([of.confidence >= LEAST_CONFIDENCE for of in found], dtype=bool)
-    return replace(wireframe, edges=edges).keep(sure & is_edge(matching, support, wireframe.shapes, LEAST_STEADY))
+    return replace(wireframe, edges=edges).keep(sure & is_edge(matching, support, wireframe.shapes, steady))
 
 
-def with_support(matching, shapes):
+def with_support(matching, shapes, steady):
     """The shapes that the images support; their places are not exact yet."""
-    kept = is_edge(matching, support_of(matching, shapes), shapes, LENIENT * LEAST_STEADY)
+    kept = is_edge(matching, support_of(matching, shapes), shapes, LENIENT * steady)
     return [shape for shape, keep in zip(shapes, kept, strict=True) if keep]
 
 

@@ -19,6 +19,7 @@ MOST_SINE = 0.35  # of the angle between an edgel and a projected direction: 20 
 OWNED_PX, OWNED_MOST = 2.0, 6  # neighbours of an edgel: those so near, itself included, at most so many,
 OWNED_BESIDE_PX = 0.5  # and no farther to the side: an edge may run beside another
 APART = 100.0  # px; views are laid out so far apart when one tree holds the edgels of all of them
+LEAST_VIEWS = 2.5  # of full strength; two planes always meet
 EQUATIONS = 11  # numbers of a point's normal equations, see `add_equations`
 
 
@@ -45,11 +46,13 @@ class EdgelGrid:
 class EdgelMatching:
     """Matches points that know their direction with the edgels of all views.
 
-    edgels: those of the views. pixel: size of a pixel at the middle of the scene box, unit-cube units.
+    edgels: those of the views. pixel: size of a pixel at the scene, unit-cube units. scale_px: residual at which the
+    weight of an edgel has fallen to a quarter. least_views: that show an edge which goes on, each counted by its weight.
     """
 
-    def __init__(self, views):
+    def __init__(self, views, least_views=LEAST_VIEWS):
         self.edgels, self.pixel = views.edgels, pixel_size(views)
+        self.scale_px, self.least_views = views.tolerance_px, least_views
         self.grid = EdgelGrid(views.edgels, views.height, views.width)
         self.size = views.height, views.width
         self.cameras = upload((views.intrinsics @ views.world_to_camera).astype(np.float32))

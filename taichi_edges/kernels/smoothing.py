@@ -16,9 +16,7 @@ LEAST_AROUND = 6  # edgels; from fewer no direction is measured
 
 
 @ti.kernel
-def measure_normals(
-    rows: ti.i32, columns: ti.i32, starts: I32_1D, cells: I32_1D, elements: F32_2D, normals: F32_2D
-):
+def measure_normals(rows: ti.i32, columns: ti.i32, starts: I32_1D, cells: I32_1D, elements: F32_2D, normals: F32_2D):
     """normals (n, 2): across the principal axis of the edgels around each that continue it. cells: (n,) of each."""
     for e in range(elements.shape[0]):
         u, v, a, b = elements[e, 0], elements[e, 1], elements[e, 2], elements[e, 3]

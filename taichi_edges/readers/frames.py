@@ -113,17 +113,35 @@ def build_views(frames, edge_maps, edgels, config, box, progress):
     _check_box_seen(frames, intrinsics, poses, np.asarray(box, dtype=np.float64), (width, height), opengl)
     world_to_camera = invert_pose(poses)
     similarity = Similarity.of_box(box)
+    moved = into_unit_cube(world_to_camera, similarity)
+    points = None if frames.points is None or not len(frames.points) else similarity.to_unit(frames.points)
     return Views(
         names=tuple(frames.names),
         edge_maps=edge_maps,
         intrinsics=intrinsics,
-        world_to_camera=into_unit_cube(world_to_camera, similarity),
+        world_to_camera=moved,
         image_paths=tuple(_usable_images(frames, progress)),
         similarity=similarity,
         box=similarity.to_unit(np.asarray(box, dtype=np.float64)),
         input_to_truth=frames.input_to_truth,
         edgels=edgels,
+        pixel=None if points is None else _pixel_at(points, intrinsics, moved, (width, height)),
+        tolerance_px=config.tolerance_px,
     )
+
+
+def _pixel_at(points, intrinsics, world_to_camera, size):
+    """Size of a pixel at the points in sight, (n, 3) unit cube: median over the views of each view's median; or None.
+
+    A camera may stand in the middle of the scene, and what it sees around it.
+    """
+    sizes = []
+    for lens, pose in zip(intrinsics, world_to_camera, strict=True):
+        pixels, depths = project(points, lens, pose)
+        inside = inside_image(pixels, *size)
+        if inside.any():
+            sizes.append(np.median(depths[inside]) / lens[0, 0])
+    return float(np.median(sizes)) if sizes else None
 
 
 def camera_poses(frames):

@@ -14,8 +14,10 @@ import taichi as ti
 from scipy.spatial import cKDTree
 
 from taichi_edges.cameras import NEAR, inside_image, project
+from taichi_edges.detectors.chains import chain_lengths
 from taichi_edges.kernels.device import download, upload
 from taichi_edges.kernels.points import F32_1D, F32_2D, I32_1D, I32_2D, U8_3D
+from taichi_edges.splatting.gaussians import orient_gaussians
 from taichi_edges.views import pixel_size
 
 EVERY_PX = 8  # one edgel in each cell of this size is a reference
@@ -30,12 +32,20 @@ NEAREST = 0.02  # unit cube: of a place to the reference's camera
 LEAST_SINE = 0.03  # of the angle between viewing planes; others have no line in common that could be compared
 CANDIDATES = 4  # depths kept for each reference
 TOGETHER = 3  # neighbours that must agree
+NEARBY_PX, ACROSS_PX = 8.0, 1.5  # candidates on the same line, along it and across
+ALIGNED = np.cos(np.radians(30.0))  # and so much in the same direction: a bin is 15 degrees wide
+LEAST_COMPANIONS = 4
+SEARCHED = 20_000  # candidates whose companions are looked for at the same time
+THINNED_PX = 3.0  # one seed in each cell of this size
+LEAST_VOTED = 50  # fewer seeds than this are no start
+ALONG_PX, BESIDE_PX = 2.0, 0.7  # standard deviations of a Gaussian, in pixels at the scene
 
 
 @dataclass(frozen=True)
 class SweepSeeds:
-    """points, directions: (n, 3) unit cube. views: (n,) that agree, the reference included. companions: (n,) how many
-    other candidates lie on the same line nearby. pixel: (n,) size of a pixel at each point, unit-cube units."""
+    """points, directions: (n, 3) unit cube. views: (n,) that agree, the reference included. companions: (n,) see
+    `companions_of`. pixel: (n,) size of a pixel at each point, unit-cube units.
+    """
 
     points: np.ndarray
     directions: np.ndarray
@@ -181,7 +191,7 @@ def camera_centres(views):
 
 
 def sweep_view(views, view, chosen, others, maps):
-    """Candidate points (k, 3), directions (k, 3), counts (k,), depths (k,) of the chosen edgels of one view."""
+    """Candidate points (k, 3), directions (k, 3), numbers of views (k,), pixel sizes (k,) of the chosen edgels of one view."""
     pixels, normals, _ = views.edgels.of_view(view)
     pixels, normals = pixels[chosen].astype(np.float64), normals[chosen].astype(np.float64)
     lens, pose = views.intrinsics[view], views.world_to_camera[view]
@@ -196,8 +206,6 @@ def sweep_view(views, view, chosen, others, maps):
     baselines = np.linalg.norm(centres[others] - centre, axis=1)
     near = np.maximum(near, max(NEAREST, np.sort(baselines)[TOGETHER - 1] / np.tan(MOST_ANGLE)))
     good = far > near
-    if not good.any():
-        return None
     rays, planes, near, far = rays[good], planes[good], near[good], far[good]
     projections = views.intrinsics[others] @ views.world_to_camera[others]
     epipoles = projections @ np.append(centre, 1.0)
@@ -215,7 +223,7 @@ def sweep_view(views, view, chosen, others, maps):
     e1 = rays[which] / np.linalg.norm(rays[which], axis=1, keepdims=True)
     e2 = np.cross(planes[which], e1)
     directions = np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2
-    return centre + rays[which] / inverse[:, None], directions, counts[which, slot] + 1, 1 / inverse
+    return centre + rays[which] / inverse[:, None], directions, counts[which, slot] + 1, 1 / (inverse * lens[0, 0])
 
 
 def through_box(origin, rays, box):
@@ -237,16 +245,60 @@ def references(edgels, lengths):
     return chosen
 
 
-def sweep_seeds(views, lengths):
-    """SweepSeeds of all views. lengths: (e,) of the edgels' chains."""
+def sweep_seeds(views, report=None):
+    """SweepSeeds of all views. report: called with the number of views done."""
     maps = direction_maps(views.edgels, views.height, views.width)
-    chosen = references(views.edgels, lengths)
-    parts = []
+    chosen = references(views.edgels, chain_lengths(views.edgels))
+    parts = [(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int), np.zeros(0))]
     for view, others in enumerate(neighbor_views(views)):
         some = chosen[views.edgels.starts[view] : views.edgels.starts[view + 1]]
         if len(others) >= TOGETHER and some.any():
-            found = sweep_view(views, view, some, others, maps)
-            if found is not None:
-                parts.append((*found, np.full(len(found[2]), views.intrinsics[view, 0, 0])))
-    points, directions, counts, depths, focal = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    return points, directions, counts, depths / focal
+            parts.append(sweep_view(views, view, some, others, maps))
+        if report is not None:
+            report(view + 1)
+    points, directions, counts, pixel = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return SweepSeeds(points, directions, counts, companions_of(points, directions, counts, pixel), pixel)
+
+
+def companions_of(points, directions, counts, pixel):
+    """(n,) how many views more than chance's agree on candidates nearby on the same line, for each candidate.
+
+    What is nearby is a matter of pixels at the candidate, so that it is looked for among those of about its pixel size.
+    """
+    companions = np.zeros(len(points), int)
+    octaves = np.floor(np.log2(pixel)).astype(int)
+    for octave in np.unique(octaves):
+        about = np.flatnonzero(np.abs(octaves - octave) <= 1)
+        tree, own = cKDTree(points[about]), np.flatnonzero(octaves == octave)
+        for first in range(0, len(own), SEARCHED):
+            some = own[first : first + SEARCHED]
+            reach = NEARBY_PX * 2.0 ** (octave + 0.5)
+            pairs = cKDTree(points[some]).sparse_distance_matrix(tree, reach, output_type="ndarray")
+            one, other = some[pairs["i"]], about[pairs["j"]]
+            apart, direction = points[other] - points[one], directions[one]
+            across = np.linalg.norm(apart - (apart * direction).sum(axis=1)[:, None] * direction, axis=1)
+            aligned = np.abs((direction * directions[other]).sum(axis=1)) >= ALIGNED
+            same = (one != other) & aligned & (across <= ACROSS_PX * pixel[one])
+            np.add.at(companions, one[same], counts[other[same]] - 2)
+    return companions
+
+
+def swept_gaussians(views, count, opacity, generator, progress):
+    """At most `count` Gaussians where views agree on the direction of an edge, laid along it; None if too few.
+
+    ti.init must have been called. opacity: 0..1.
+    """
+    with progress.track("sweep", len(views)) as report:
+        seeds = sweep_seeds(views, report)
+    good = np.flatnonzero(seeds.companions >= LEAST_COMPANIONS)
+    order = good[np.argsort(-seeds.companions[good], kind="stable")]
+    pixel = pixel_size(views)
+    cells = np.floor(seeds.points[order] / (THINNED_PX * pixel)).astype(np.int64)
+    chosen = np.sort(order[np.unique(cells, axis=0, return_index=True)[1]])  # the best of each cell
+    if len(chosen) > count:
+        chosen = np.sort(generator.choice(chosen, count, replace=False))
+    if len(chosen) < min(LEAST_VOTED, count):
+        return None
+    return orient_gaussians(
+        seeds.points[chosen], seeds.directions[chosen], ALONG_PX * pixel, BESIDE_PX * pixel, opacity
+    )
