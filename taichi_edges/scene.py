@@ -47,7 +47,7 @@ class OnnxConfig(Section):
 class SourceConfig(Section):
     """Where edge maps and cameras come from."""
 
-    reader: Literal["nerf", "emap", "colmap", "idr", "synthetic"] = Field(
+    reader: Literal["nerf", "emap", "colmap", "idr", "images", "synthetic"] = Field(
         "emap", description="layout of the folder, see README"
     )
     path: str = Field("", description="folder, relative to the data root (--data or TAICHI_EDGES_DATA) or absolute")

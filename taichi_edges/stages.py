@@ -38,9 +38,8 @@ def prepare(run):
     from taichi_edges.readers.undistortion import undistorted_frames
 
     source = run.config.source
-    frames = _listed_frames(run)
+    frames = _posed_frames(run, chosen_frames(_listed_frames(run), source.skip))
     _pass_on(frames, run.progress)
-    frames = chosen_frames(frames, source.skip)
     camera_poses(frames)  # a mistake in them shall not wait for the detector
     box, box_from = _scene_box(run.config, frames)
     _refuse_missing_points(run, frames)
@@ -64,6 +63,17 @@ def _listed_frames(run):
 
     source = run.config.source
     return READERS[source.reader](run.data_path(source.path, "source.path"), source)
+
+
+def _posed_frames(run, frames):
+    """The frames themselves; photographs without poses after structure from motion."""
+    source = run.config.source
+    if source.reader != "images":
+        return frames
+    from taichi_edges.readers.photos import posed_photos
+
+    folder = run.data_path(source.path, "source.path")
+    return posed_photos(frames, folder, source, run.path("sfm"), run.config.seed, run.threads, run.progress)
 
 
 def _pass_on(frames, progress):
