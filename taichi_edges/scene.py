@@ -47,10 +47,12 @@ class OnnxConfig(Section):
 class SourceConfig(Section):
     """Where edge maps and cameras come from."""
 
-    reader: Literal["nerf", "emap", "colmap", "idr", "images", "synthetic"] = Field(
-        "emap", description="layout of the folder, see README"
+    reader: Literal["auto", "colmap", "emap", "idr", "images", "nerf", "nerfstudio", "synthetic"] = Field(
+        "auto", description="layout of the folder, see docs/inputs.md; auto: recognised from what is in it"
     )
-    path: str = Field("", description="folder, relative to the data root (--data or TAICHI_EDGES_DATA) or absolute")
+    path: str = Field(
+        "", description="folder, or the file in it that lists the views; relative to the data root or absolute"
+    )
     edges: str = Field("", description="folder of ready edge maps inside `path`, e.g. edge_DexiNed")
     images: str = Field("", description="folder of the colour images inside `path`; '': where the layout has them")
     masks: str = Field(
@@ -250,10 +252,18 @@ def _auto_or(value, check):
     return value if value == "auto" else check(value)
 
 
-class EvaluationConfig(Section):
-    """Ground truth, where there is one."""
+def _is_held_out(value):
+    names = isinstance(value, list) and value and all(isinstance(name, str) for name in value)
+    return bool(names) or (type(value) is int and value > 0)
 
-    truth: str = Field("", description="ABC folder, PLY or edge JSON, relative to the data root; '': no evaluation")
+
+class EvaluationConfig(Section):
+    """Ground truth, where there is one, and views that only the evaluation sees."""
+
+    truth: str = Field("", description="ABC folder, PLY or edge JSON, relative to the data root; '': there is none")
+    held_out: Annotated[str | int | list[str], _measured_or(_is_held_out, "a number, or a list of names, of views")] = (
+        Field("auto", description="views kept for the evaluation: their number or names; auto: one in ten, at most 3")
+    )
 
 
 class SceneConfig(Section):
@@ -261,6 +271,7 @@ class SceneConfig(Section):
 
     name: Name = Field("scene", description="folder of the results; the file's name unless set")
     preset: Literal["fast", "paper"] = Field("fast", description="the schedule the scene starts from")
+    scale: Literal["object", "building", "room"] = Field("object", description="settings for scenes of this size")
     seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of every random choice")
     box: Annotated[Box, WrapValidator(_auto_or), PlainSerializer(lambda box: box)] = Field(
         "auto", description="opposite corners of the scene, input units; auto: the layout's, else the unit cube"
@@ -361,4 +372,14 @@ PRESETS = {
         "filter": {"refine": True},
         "refine": {"enabled": True},
     },
+}
+
+# What a preset says otherwise for scenes of other sizes, on top of it and below the scene file: SCALES[scale][preset].
+LARGE_IN_THE_PAPER = {  # supplement: "for large scenes" lambda_1 = lambda_2 = 0.01, k = 4 as ever, seeded by SfM points
+    "train": {"seeds": "auto", "orient_weight": 0.01, "shape_weight": 0.01},
+}
+SCALES = {
+    "object": {"paper": {}, "fast": {}},
+    "building": {"paper": LARGE_IN_THE_PAPER, "fast": {}},
+    "room": {"paper": LARGE_IN_THE_PAPER, "fast": {}},
 }

@@ -30,7 +30,10 @@ CALIBRATION_SEEDS = 4000  # 3D points through which a detector's biases are meas
 
 
 def prepare(run):
-    """Source -> `views.npz` and `detection.png`; of synthetic scenes also `truth.json` and pictures in `images/`."""
+    """Source -> `views.npz`, `held_out.npz` (views for the evaluation alone) and `detection.png`.
+
+    Of synthetic scenes also `truth.json` and pictures in `images/`.
+    """
     if run.config.source.reader == "synthetic":
         return _prepare_synthetic(run)
     from taichi_edges.detectors import DETECTORS, choose_detector
@@ -127,25 +130,31 @@ def _refuse_needless_calibration(run, detector):
 
 
 def _finish_views(run, views, frames=None):
-    """Trace and calibrate the edgels where the detector gave maps, write `views.npz` and the report; the facts.
+    """Trace and calibrate the edgels where the detector gave maps, write the views and the report; the facts.
 
     frames: whose masks drop edgels; None where there are none.
     """
-    facts = {"views": len(views), "width_px": views.width, "height_px": views.height}
-    residuals, traced_here = {}, views.edgels is None
+    from taichi_edges.evaluation.held_out import choose_held_out, split_views
+
+    facts, residuals = {"width_px": views.width, "height_px": views.height}, {}
+    traced_here = views.edgels is None
     if traced_here:
         views, width = _traced(run, views)
         facts["line_width_px"] = round(width, 2)
     if frames is not None:
         views, dropped = _masked(run, views, frames, redraw=not traced_here)
         facts |= {} if dropped is None else {"masked_edgels": dropped}
+    views, held_out = split_views(views, choose_held_out(views.names, run.config.evaluation.held_out))
+    facts = {"views": len(views), "held_out": list(held_out.names), **facts}
     if traced_here:
         views, calibration = _calibrated(run, views)
         if calibration is not None:
+            held_out = _corrected(run, held_out, calibration)
             facts["calibration"] = calibration.facts()
             residuals = {"residuals": calibration.residuals, "on_silhouette": calibration.on_silhouette}
     facts["edgels"] = len(views.edgels)
     write_views(run.path("views.npz"), views)
+    write_views(run.path("held_out.npz"), held_out)
     return {**facts, "files": [_write_sheet(run, views, residuals)]}
 
 
@@ -237,6 +246,18 @@ def _calibrate(run, views, thin):
     return calibrate(
         with_whole_paths(run, views), views.edgels, seeds.points, seeds.directions, shift, silhouette, run.threads
     )
+
+
+def _corrected(run, views, calibration):
+    """Views that the calibration has not seen, their edgels without the biases that it found in others."""
+    from taichi_edges.detectors.calibration import sides_of
+
+    if not len(views) or not (calibration.shift_applied or calibration.silhouette_applied):
+        return views
+    silhouette, shift = calibration.silhouette_applied * calibration.silhouette, calibration.shift
+    values = np.array([silhouette, *(calibration.shift_applied * shift)])
+    sides = sides_of(with_whole_paths(run, views), views.edgels, run.threads)
+    return replace(views, edgels=sides.correct(views.edgels, values)[0])
 
 
 def _write_sheet(run, views, residuals):
@@ -451,21 +472,25 @@ def truth_path(run):
 def evaluate(run):
     """`edges.json` -> `metrics.json` and `metrics.csv`: EMAP's protocol, corners, free ends; without a truth fewer.
 
-    Lengths are in the frame of the truth, in the unit cube where there is none.
+    And what the held-out views say. Lengths are in the frame of the truth, in the unit cube where there is none.
     """
     from taichi_edges.evaluation.ground_truth import read_ground_truth
+    from taichi_edges.evaluation.held_out import held_out_metrics
     from taichi_edges.evaluation.metrics import evaluate as measure
-    from taichi_edges.evaluation.metrics import measure_alone
+    from taichi_edges.evaluation.metrics import exact_polylines, measure_alone
 
     edges, _ = read_edges(run.path("edges.json"))
     views, path = read_views(run.path("views.npz")), truth_path(run)
+    unit = edges.transformed(views.similarity.to_unit)
     if path is None:
-        metrics = {**measure_alone(edges.transformed(views.similarity.to_unit)), "ground_truth": None}
+        metrics, source = measure_alone(unit), None
     else:
         to_truth, from_truth = views.input_to_truth, np.linalg.inv(views.input_to_truth)
         truth = read_ground_truth(path, lambda points: views.similarity.to_unit(transform(from_truth, points)))
         into_frame = partial(transform, to_truth) if truth.own_frame else views.similarity.to_unit
-        metrics = {**measure(edges.transformed(into_frame), truth), "ground_truth": truth.source}
+        metrics, source = measure(edges.transformed(into_frame), truth), truth.source
+    metrics |= held_out_metrics(exact_polylines(unit), views, read_views(run.path("held_out.npz")))
+    metrics["ground_truth"] = source
     write_json(run.path("metrics.json"), metrics)
     _write_csv(run.path("metrics.csv"), [("metric", "value"), *metrics.items()])
     return metrics

@@ -218,8 +218,13 @@ def _check_intrinsics(frames, intrinsics, width, height, progress):
 
 def folders_beside(frames):
     """The folders next to the file that lists the frames, in words."""
-    folders = sorted(p.name for p in frames.where.parent.iterdir() if p.is_dir())
-    return name_some(folders, 8) or "no folders"
+    return folders_in(frames.where.parent)
+
+
+def folders_in(folder):
+    """The folders in a folder, in words."""
+    names = sorted(p.name for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
+    return name_some(names, 8) or "no folders"
 
 
 def is_whole(path):

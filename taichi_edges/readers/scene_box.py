@@ -36,6 +36,19 @@ def scene_box(points, camera_to_world):
     return _widened(*np.quantile(inside, [STRAY, 1 - STRAY], axis=0))
 
 
+def box_of_cameras(camera_to_world, fields):
+    """(2, 3) corners of a cube that every camera sees about whole, where all look at one place; None where they do not.
+
+    A guess, for want of points. camera_to_world: (V, 4, 4), OpenCV axes. fields: (V,) width of the narrower field of
+    view at distance 1.
+    """
+    focus, distance = _focus(camera_to_world)
+    if focus is None:
+        return None
+    half = 0.5 * distance * float(np.median(fields))
+    return np.array([focus - half, focus + half])
+
+
 def _about_the_focus(points, camera_to_world):
     """(n,) bool: the points that the cameras stand around; all of them where they stand in a room or along a street."""
     focus, distance = _focus(camera_to_world)
