@@ -162,10 +162,11 @@ def distorted_pixels(lens, rays):
     return lens.camera().img_from_cam(np.ascontiguousarray(rays, dtype=np.float64)) - HALF_PIXEL
 
 
-def reconstruct(images, names, groups, folder, seed, threads, progress):
+def reconstruct(images, names, groups, folder, seed, threads, progress, masks=None):
     """Structure from motion on the CPU; the COLMAP model with the most images is written to `folder`/sparse.
 
     images: the folder of the images. names: (V,) relative paths. groups: lists of names that share a camera.
+    masks: a folder of PNG files named `<name>.png`, 0 where features do not count; None without.
     The same seed gives the same model, whatever the number of threads. Returns the names of the registered images,
     [] where there is no model.
     """
@@ -173,7 +174,7 @@ def reconstruct(images, names, groups, folder, seed, threads, progress):
     database = folder / "database.db"
     database.unlink(missing_ok=True)
     try:
-        _extract(database, images, names, groups, threads, progress)
+        _extract(database, images, names, groups, masks, threads, progress)
         numbers = _numbered(database)
         _match(database, folder / "pairs.txt", [numbers[name] for name in names], seed, threads, progress)
         model = _map(database, images, folder / "models", len(names), seed, progress)
@@ -191,7 +192,7 @@ def reconstruct(images, names, groups, folder, seed, threads, progress):
     return sorted(image.name for image in model.images.values() if image.has_pose)
 
 
-def _extract(database, images, names, groups, threads, progress):
+def _extract(database, images, names, groups, masks, threads, progress):
     """Cameras, in the order of the groups, then features, some images at a time."""
     pycolmap = _colmap()
     pycolmap.Database.open(str(database)).close()
@@ -199,12 +200,12 @@ def _extract(database, images, names, groups, threads, progress):
         reader = pycolmap.ImageReaderOptions(camera_model="OPENCV" if len(group) >= RICH else "SIMPLE_RADIAL")
         pycolmap.import_images(str(database), str(images), pycolmap.CameraMode.SINGLE, group, reader)
     options = pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False)
+    reader = pycolmap.ImageReaderOptions(mask_path=str(masks)) if masks else pycolmap.ImageReaderOptions()
+    single, device = pycolmap.CameraMode.SINGLE, pycolmap.Device.cpu  # images keep the cameras that they have
     with progress.track("find features", len(names)) as report:
         for start in range(0, len(names), threads):
             some = names[start : start + threads]
-            pycolmap.extract_features(
-                str(database), str(images), some, extraction_options=options, device=pycolmap.Device.cpu
-            )
+            pycolmap.extract_features(str(database), str(images), some, single, reader, options, device)
             report(min(start + threads, len(names)))
 
 

@@ -37,20 +37,22 @@ def prepare(run):
     if run.config.source.reader == "synthetic":
         return _prepare_synthetic(run)
     from taichi_edges.detectors import DETECTORS, choose_detector
-    from taichi_edges.readers.frames import build_views, camera_poses, chosen_frames
+    from taichi_edges.readers.frames import build_views, camera_poses, chosen_frames, frames_in_sight
     from taichi_edges.readers.undistortion import undistorted_frames
 
     source = run.config.source
     frames = _posed_frames(run, chosen_frames(_listed_frames(run), source.skip))
     _pass_on(frames, run.progress)
     camera_poses(frames)  # a mistake in them shall not wait for the detector
-    box, box_from = _scene_box(run.config, frames)
+    box, box_from = _scene_box(run, frames)
     _refuse_missing_points(run, frames)
     detector = choose_detector(source, frames)
     _refuse_needless_calibration(run, detector)
     frames = undistorted_frames(
         frames, run.path("undistorted"), source.max_size, source.gamma, run.threads, run.progress
     )
+    if box_from == "reader":
+        frames = frames_in_sight(frames, box, source.axes, run.progress)
     frames, edge_maps, edgels = DETECTORS[detector](frames, run)
     views = _inside_the_run(run, build_views(frames, edge_maps, edgels, source, box, run.progress))
     facts = _finish_views(run, views, frames)
@@ -87,11 +89,15 @@ def _pass_on(frames, progress):
         progress.warn(warning)
 
 
-def _scene_box(config, frames):
+def _scene_box(run, frames):
     """(2, 3) corners of the scene, input units, and where they are from."""
-    if config.box != "auto":
-        return config.box, "scene"
+    if run.config.box != "auto":
+        return run.config.box, "scene"
     if frames.box is not None:
+        corners = " to ".join("(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in frames.box)
+        run.progress.say(
+            f"scene box {corners}, in units of the cameras, as the layout has it; the key box sets another"
+        )
         return frames.box, "reader"
     if frames.points is not None:
         found = f"{len(frames.points)} points fit well enough to tell where the scene is"
@@ -361,11 +367,14 @@ def _start(run, views, generator):
         instead = {"points": "the given points", "random": "random points"}[seeds]
         found = f"the views agree on an edge in fewer than {LEAST_VOTED} places"
         run.progress.warn(f"{found}; the training starts from {instead} instead")
-    if seeds == "points" or (seeds == "auto" and run.path("seeds.ply").is_file()):
+    if seeds == "random" or not run.path("seeds.ply").is_file():
+        points = random_points(config.gaussians, views.box, generator)
+    else:
         given = stack_fields(read_vertices(run.path("seeds.ply"), ("x", "y", "z")), ("x", "y", "z"))
         points = given_points(views.similarity.to_unit(given.astype(np.float64)), config.gaussians, generator)
-    else:
-        points = random_points(config.gaussians, views.box, generator)
+        if seeds == "auto":  # structure from motion finds few points where there is no texture
+            more = random_points(config.gaussians - len(points), views.box, generator)
+            points = np.concatenate([points, more])
     return start_gaussians(points, generator, config.initial_scale, config.initial_opacity)
 
 

@@ -154,6 +154,23 @@ def test_a_folder_without_images_is_refused_and_what_it_holds_is_said(tmp_path):
         read_photos(tmp_path, config_of(tmp_path))
 
 
+def test_masked_parts_of_photographs_have_no_say_in_where_they_were_taken(album, solved, tmp_path):
+    """The textures are kept on two walls of three."""
+    folder, poses = album
+    for name in poses:
+        kept = corner_of_a_room(poses[name], [np.full((512, 512), grey, np.uint8) for grey in (255, 255, 0)])
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / "masks" / f"{name}.png"), np.where(kept == 255, 255, 0))
+        (tmp_path / f"{name}.png").write_bytes((folder / f"{name}.png").read_bytes())
+    frames, _ = posed(tmp_path, tmp_path / "cache")
+    aligned = similar(
+        np.stack(frames.camera_to_world)[:, :3, 3], np.array([invert_pose(poses[n])[:, 3] for n in frames.names])
+    )
+    points = aligned(frames.points)
+    on_third = (np.abs(points[:, 2]) < 0.02) & (points[:, :2] > 0.06).all(axis=1)
+    assert len(points) > 50 and on_third.mean() < 0.02
+
+
 def test_masks_and_edge_maps_below_the_folder_are_no_photographs(tmp_path):
     for name in ("a/1.jpg", "b/1.jpg", "masks/a/1.png", "edges/a/1.png", ".thumbs/1.jpg"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

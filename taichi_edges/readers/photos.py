@@ -3,6 +3,9 @@
 import json
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
 
 from taichi_edges.artefacts import digest, digest_file, write_json
 from taichi_edges.errors import UserError, name_some
@@ -10,6 +13,7 @@ from taichi_edges.photogrammetry import known_focal_length, model_files, reconst
 from taichi_edges.readers.colmap import frames_of_model
 from taichi_edges.readers.companions import edge_paths, is_picture, mask_folder, mask_paths
 from taichi_edges.readers.frames import Frames, is_usable
+from taichi_edges.readers.images import read_mask
 from taichi_edges.readers.picture_sizes import picture_size
 
 METHOD = 1  # raised when the same photographs give another reconstruction
@@ -65,12 +69,17 @@ def posed_photos(frames, folder, config, cache, seed, threads, progress):
     images, names = frames.where, _whole(frames, progress)
     if len(names) < FEWEST:
         raise UserError(f"{images}: {len(names)} photographs are too few to find where they were taken; {ADVICE}")
-    key = digest([METHOD, seed, [(name, digest_file(images / name)) for name in names]])
+    masks = {name: path for name, path in zip(_names(frames), frames.mask_paths, strict=True) if path}
+    seen = [(name, *map(digest_file, [images / name, *([masks[name]] if name in masks else [])])) for name in names]
+    key = digest([METHOD, seed, seen])
     record = cache / "photographs.json"
     registered = _known(record, key, cache)
     if registered is None:
         progress.say(f"structure from motion from {len(names)} photographs, once")
-        registered = reconstruct(images, names, _by_camera(images, names, threads), cache, seed, threads, progress)
+        groups = _by_camera(images, names, threads)
+        with TemporaryDirectory() as folder_of_masks:
+            named = _named_masks(masks, Path(folder_of_masks)) if masks else None
+            registered = reconstruct(images, names, groups, cache, seed, threads, progress, named)
         write_json(record, {"key": key, "registered": registered})
     _check_registered(images, names, registered, progress)
     found = frames_of_model(folder, cache / "sparse", images, config)
@@ -78,9 +87,25 @@ def posed_photos(frames, folder, config, cache, seed, threads, progress):
     return found
 
 
+def _named_masks(masks, folder):
+    """The masks, {name of the photograph: path}, in a folder where COLMAP finds them: PNG files `<name>.png`."""
+    import cv2
+
+    for name, path in masks.items():
+        target = folder / f"{name}.png"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(cv2.imencode(".png", np.uint8(255) * read_mask(path))[1])
+    return folder
+
+
+def _names(frames):
+    """(V,) paths of the photographs, relative to their folder."""
+    return [Path(path).relative_to(frames.where).as_posix() for path in frames.image_paths]
+
+
 def _whole(frames, progress):
     """Names of the photographs that are whole; the others are named in a warning."""
-    names = [Path(path).relative_to(frames.where).as_posix() for path in frames.image_paths]
+    names = _names(frames)
     whole = [name for name, path in zip(names, frames.image_paths, strict=True) if is_usable(path)]
     if len(whole) < len(names):
         lost = [name for name in names if name not in set(whole)]

@@ -75,7 +75,7 @@ def undistorted_frames(frames, folder, max_size, gamma=None, threads=None, progr
         frames,
         intrinsics=[plan.intrinsics_for for plan in plans],
         lenses=[None] * len(plans),
-        size=plans[0].canvas if frames.size else None,
+        size=plans[0].canvas,
         **made,
     )
 
