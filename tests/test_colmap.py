@@ -180,6 +180,21 @@ def test_a_damaged_model_is_refused_in_one_line(project, damaged, text):
     assert "not a COLMAP model that can be read" in refusal(folder)
 
 
+def test_a_model_without_points_needs_a_box_from_the_scene(tmp_path, poses):
+    write_model(tmp_path / "sparse", ["a.png"] * 1, [camera("PINHOLE")], poses[:1], np.zeros((0, 3)))
+    (tmp_path / "images").mkdir()
+    picture = cv2.rectangle(np.zeros(SIZE[::-1], np.uint8), (100, 70), (220, 170), 200, -1)
+    cv2.imwrite(str(tmp_path / "images" / "a.png"), picture)
+    (tmp_path / "run").mkdir()
+    with pytest.raises(UserError, match="images.bin: only 0 points fit well enough .*; set box"):
+        stages.prepare(Run(scene(tmp_path), tmp_path / "run"))
+    with pytest.raises(UserError, match="train.seeds is 'points', but the model has none"):
+        box = [[0, 0, 0], [1, 1, 1]]
+        stages.prepare(Run(scene(tmp_path, box=box, train={"seeds": "points"}), tmp_path / "run"))
+    facts = stages.prepare(Run(scene(tmp_path, box=[[0, 0, 0], [1, 1, 1]]), tmp_path / "run"))
+    assert facts["box_from"] == "scene" and "seeds.ply" not in facts["files"]
+
+
 def test_points_that_fit_badly_or_few_images_see_are_left_out(tmp_path, poses, points):
     names = [f"{view}.jpg" for view in range(VIEWS)]
     write_model(tmp_path / "sparse", names, [camera()] * VIEWS, poses, points)
