@@ -37,8 +37,7 @@ def prepare(run):
     if run.config.source.reader == "synthetic":
         return _prepare_synthetic(run)
     from taichi_edges.detectors import DETECTORS, choose_detector
-    from taichi_edges.readers.frames import build_views, camera_poses, chosen_frames, frames_in_sight
-    from taichi_edges.readers.undistortion import undistorted_frames
+    from taichi_edges.readers.frames import build_views, camera_poses, chosen_frames
 
     source = run.config.source
     frames = _posed_frames(run, chosen_frames(_listed_frames(run), source.skip))
@@ -48,18 +47,13 @@ def prepare(run):
     _refuse_missing_points(run, frames)
     detector = choose_detector(source, frames)
     _refuse_needless_calibration(run, detector)
-    frames = undistorted_frames(
-        frames, run.path("undistorted"), source.max_size, source.gamma, run.threads, run.progress
-    )
-    if box_from == "reader":
-        frames = frames_in_sight(frames, box, source.axes, run.progress)
+    frames = _undistorted(run, frames, box if box_from == "reader" else None)
     frames, edge_maps, edgels = DETECTORS[detector](frames, run)
     views = _inside_the_run(run, build_views(frames, edge_maps, edgels, source, box, run.progress))
-    facts = _finish_views(run, views, frames)
+    facts = {"detector": detector, "box": np.array(box).tolist(), "box_from": box_from}
+    facts |= _finish_views(run, views, frames)
     own = [path for path in views.image_paths if path and not Path(path).is_absolute()]
-    points = _write_points(run, frames, box)
-    about_box = {"box": np.asarray(box, dtype=float).tolist(), "box_from": box_from}
-    return {"detector": detector, **about_box, **facts, "files": [*own, *facts["files"], *points]}
+    return {**facts, "files": [*own, *facts["files"], *_write_points(run, frames, box)]}
 
 
 def _listed_frames(run):
@@ -103,6 +97,16 @@ def _scene_box(run, frames):
         found = f"{len(frames.points)} points fit well enough to tell where the scene is"
         raise UserError(f"{frames.where}: only {found}; set box, or raise source.max_point_error")
     return UNIT_CUBE, "unit cube"
+
+
+def _undistorted(run, frames, guessed_box):
+    """The frames as pinhole cameras would have taken them; without those that do not see a box nobody has set."""
+    from taichi_edges.readers.frames import frames_in_sight
+    from taichi_edges.readers.undistortion import undistorted_frames
+
+    source, folder = run.config.source, run.path("undistorted")
+    frames = undistorted_frames(frames, folder, source.max_size, source.gamma, run.threads, run.progress)
+    return frames if guessed_box is None else frames_in_sight(frames, guessed_box, source.axes, run.progress)
 
 
 def _refuse_missing_points(run, frames):
