@@ -404,6 +404,7 @@ PHOTOGRAPHED = {
         "grow": 0.0,
         "grow_step": 3.0,
     },
+    "cluster": {"min_points": 5, "max_gap": 0.015},
     "refine": {"min_views": 2.0, "min_steadiness": 0.3},
 }
 SCALES = {

@@ -162,12 +162,13 @@ def _finish_views(run, views, frames=None):
             held_out = _corrected(run, held_out, calibration)
             facts["calibration"] = calibration.facts()
             residuals = {"residuals": calibration.residuals, "on_silhouette": calibration.on_silhouette}
+    sheet = _write_sheet(run, views, residuals)
     if run.config.source.min_chain:
         views = _chained(run, views)
     facts["edgels"] = len(views.edgels)
     write_views(run.path("views.npz"), views)
     write_views(run.path("held_out.npz"), held_out)
-    return {**facts, "files": [_write_sheet(run, views, residuals)]}
+    return {**facts, "files": [sheet]}
 
 
 def _chained(run, views):
