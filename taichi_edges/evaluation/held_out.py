@@ -41,21 +41,23 @@ ASIDE_EVERY = 4  # samples that are displaced: chance needs no more
 def choose_held_out(names, wanted):
     """Indices of the views to hold out, ascending. wanted: 'auto', 'off', a number, or a tuple of names.
 
-    Those that `auto` and a number choose are spread evenly over the order of the views; the first and the last stay,
-    at the ends of a path of cameras.
+    Those that `auto` and a number choose are in the middles of equal stretches of all views; the first and the last
+    stay, at the ends of a path of cameras.
     """
     if isinstance(wanted, (tuple, list)):
         for name in wanted:
             if name not in names:
                 raise UserError(f"evaluation.held_out: there is no view '{name}'{did_you_mean(name, list(names))}")
-        chosen = sorted({list(names).index(name) for name in wanted})
+        chosen = {list(names).index(name) for name in wanted}
     else:
         count = {"off": 0, "auto": _automatic(len(names))}.get(wanted, wanted)
-        chosen = [1 + (2 * number + 1) * (len(names) - 2) // (2 * count) for number in range(count)]
-    if chosen and len(names) - len(chosen) < LEAST_LEFT:
-        left = f"{len(chosen)} of {len(names)} views leave too few to find edges in"
-        raise UserError(f"evaluation.held_out: {left} (at least {LEAST_LEFT}); hold out fewer, or none: off")
-    return chosen
+        middles = ((2 * number + 1) * len(names) // (2 * count) for number in range(count))
+        chosen = {min(max(middle, 1), len(names) - 2) for middle in middles}
+    left = len(names) - len(chosen)
+    if chosen and (left < LEAST_LEFT or left < len(chosen)):
+        problem = f"{len(chosen)} of {len(names)} views leave too few to find edges in"
+        raise UserError(f"evaluation.held_out: {problem}; hold out at most half of them, and leave {LEAST_LEFT}")
+    return sorted(chosen)
 
 
 def _automatic(count):
