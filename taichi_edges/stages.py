@@ -9,6 +9,7 @@ stage that needs it: a run that is up to date, and a mistake in the scene file, 
 import csv
 import io
 import json
+import os
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -24,6 +25,7 @@ from taichi_edges.views import read_views, write_views
 from taichi_edges.wireframe import read_wireframe, write_wireframe
 
 WIDEST_PX = 40.0  # of a detector's lines
+UNIT_CUBE = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 CALIBRATION_SEEDS = 4000  # 3D points through which a detector's biases are measured, at most
 
 
@@ -35,40 +37,78 @@ def prepare(run):
     if run.config.source.reader == "synthetic":
         return _prepare_synthetic(run)
     from taichi_edges.detectors import DETECTORS, choose_detector
-    from taichi_edges.readers.frames import build_views, camera_poses
+    from taichi_edges.readers.frames import build_views, camera_poses, chosen_frames
+    from taichi_edges.readers.undistortion import undistorted_frames
 
     source = run.config.source
-    frames = _frames(run, source)
+    frames = _listed_frames(run)
+    _pass_on(frames, run.progress)
+    frames = chosen_frames(frames, source.skip)
     camera_poses(frames)  # a mistake in them shall not wait for the detector
+    box, box_from = _scene_box(run.config, frames)
+    _refuse_missing_points(run, frames)
     detector = choose_detector(source, frames)
     _refuse_needless_calibration(run, detector)
+    frames = undistorted_frames(
+        frames, run.path("undistorted"), source.max_size, source.gamma, run.threads, run.progress
+    )
     frames, edge_maps, edgels = DETECTORS[detector](frames, run)
-    box = run.config.box if frames.box is None else frames.box
-    if any(frames.mask_paths):
-        from taichi_edges.detectors.drawing import draw_edge_maps
-        from taichi_edges.detectors.masks import within_masks
-        from taichi_edges.detectors.ridges import trace_ridges
-
-        height, width = edge_maps.shape[1:]
-        if edgels is None:
-            edgels = trace_ridges(edge_maps, 4.0, source.thin_threshold, run.threads)
-        edgels = within_masks(edgels, frames.mask_paths, (width, height))
-        edge_maps = draw_edge_maps(edgels, height, width, run.threads)
-    views = build_views(frames, edge_maps, edgels, source, box, run.progress)
-    return {"detector": detector, **_finish_views(run, views)}
+    views = _inside_the_run(run, build_views(frames, edge_maps, edgels, source, box, run.progress))
+    facts = _finish_views(run, views, frames)
+    own = [path for path in views.image_paths if path and not Path(path).is_absolute()]
+    points = _write_points(run, frames, box)
+    about_box = {"box": np.asarray(box, dtype=float).tolist(), "box_from": box_from}
+    return {"detector": detector, **about_box, **facts, "files": [*own, *facts["files"], *points]}
 
 
-def _frames(run, source):
-    """The frames of a `source` section, without those to skip, and without the distortion of their lenses."""
+def _listed_frames(run, **changed):
+    """What the reader found. changed: keys of the scene's source that are to be read otherwise."""
     from taichi_edges.readers import READERS
-    from taichi_edges.readers.frames import chosen_frames
 
-    frames = chosen_frames(READERS[source.reader](run.data_path(source.path, "source.path"), source), source.skip)
-    if any(frames.lenses):
-        from taichi_edges.readers.undistortion import undistorted_frames
+    source = run.config.source.model_copy(update=changed)
+    return READERS[source.reader](run.data_path(source.path, "source.path"), source)
 
-        frames = undistorted_frames(frames, run.path("undistorted"))
-    return frames
+
+def _pass_on(frames, progress):
+    """Tell the user what the reader has to say."""
+    for note in frames.notes:
+        progress.say(note)
+    for warning in frames.warnings:
+        progress.warn(warning)
+
+
+def _scene_box(config, frames):
+    """(2, 3) corners of the scene, input units, and where they are from."""
+    if config.box != "auto":
+        return config.box, "scene"
+    if frames.box is not None:
+        return frames.box, "reader"
+    if frames.points is not None:
+        found = f"{len(frames.points)} points fit well enough to tell where the scene is"
+        raise UserError(f"{frames.where}: only {found}; set box, or raise source.max_point_error")
+    return UNIT_CUBE, "unit cube"
+
+
+def _refuse_missing_points(run, frames):
+    """UserError where the training is to start from points and there are none."""
+    if run.config.train.seeds == "points" and not run.config.source.points and not _has_points(frames):
+        problem = "train.seeds is 'points', but the model has none that fit"
+        raise UserError(f"{frames.where}: {problem}; set source.points or another train.seeds")
+
+
+def _has_points(frames):
+    return frames.points is not None and len(frames.points) > 0
+
+
+def _inside_the_run(run, views):
+    """The views with paths relative to the run's folder for pictures in it: it may be moved."""
+    folder = str(run.folder)
+    paths = (os.path.relpath(path, folder) if path and _lies_in(path, folder) else path for path in views.image_paths)
+    return replace(views, image_paths=tuple(paths))
+
+
+def _lies_in(path, folder):
+    return os.path.commonpath([os.path.abspath(path), os.path.abspath(folder)]) == os.path.abspath(folder)
 
 
 def _refuse_needless_calibration(run, detector):
@@ -79,17 +119,24 @@ def _refuse_needless_calibration(run, detector):
         raise UserError(f"{problem}; leave it out, or name ready maps in source.edges")
 
 
-def _finish_views(run, views):
-    """Trace and calibrate the edgels where the detector gave maps, write the views and the report; the facts."""
+def _finish_views(run, views, frames=None):
+    """Trace and calibrate the edgels where the detector gave maps, write the views and the report; the facts.
+
+    frames: whose masks drop edgels; None where there are none.
+    """
     from taichi_edges.evaluation.held_out import choose_held_out, split_views
 
-    facts, residuals, traced = {"width_px": views.width, "height_px": views.height}, {}, views.edgels is None
-    if traced:
+    facts, residuals = {"width_px": views.width, "height_px": views.height}, {}
+    traced_here = views.edgels is None
+    if traced_here:
         views, width = _traced(run, views)
         facts["line_width_px"] = round(width, 2)
+    if frames is not None:
+        views, dropped = _masked(run, views, frames, redraw=not traced_here)
+        facts |= {} if dropped is None else {"masked_edgels": dropped}
     views, held_out = split_views(views, choose_held_out(views.names, run.config.evaluation.held_out))
     facts = {"views": len(views), "held_out": list(held_out.names), **facts}
-    if traced:
+    if traced_here:
         views, calibration = _calibrated(run, views)
         held_out = _corrected(run, held_out, calibration)
         if calibration is not None:
@@ -98,7 +145,25 @@ def _finish_views(run, views):
     facts["edgels"] = len(views.edgels)
     write_views(run.path("views.npz"), views)
     write_views(run.path("held_out.npz"), held_out)
-    return {**facts, "files": [_write_sheet(run, views, residuals), *_copy_points(run)]}
+    return {**facts, "files": [_write_sheet(run, views, residuals)]}
+
+
+def _masked(run, views, frames, redraw):
+    """The views without the edgels that their masks drop, and how many those are; None without masks.
+
+    redraw: the maps are drawn through the edgels; else they are black where masks are, and drawn anew later, or not.
+    """
+    from taichi_edges.detectors.drawing import draw_edge_maps
+    from taichi_edges.detectors.masks import blank_outside, has_areas, within_masks
+
+    if not has_areas(frames):
+        return views, None
+    kept = within_masks(views.edgels, frames, (views.width, views.height), run.progress)
+    if redraw:
+        maps = draw_edge_maps(kept, views.height, views.width, run.threads)
+    else:
+        maps = blank_outside(views.edge_maps, frames)
+    return replace(views, edgels=kept, edge_maps=maps), len(views.edgels) - len(kept)
 
 
 def _detected_in_pictures(run, views):
@@ -179,7 +244,9 @@ def _corrected(run, views, calibration):
     from taichi_edges.detectors.drawing import draw_edge_maps
 
     edgels = views.edgels
-    if len(edgels) and calibration is not None:
+    if not len(views):
+        return views
+    if calibration is not None and len(edgels):
         silhouette = calibration.silhouette_applied * calibration.silhouette
         values = np.array([silhouette, *(calibration.shift_applied * calibration.shift)])
         edgels = sides_of(with_whole_paths(run, views), edgels, run.threads).correct(edgels, values)[0]
@@ -195,15 +262,21 @@ def _write_sheet(run, views, residuals):
     return "detection.png"
 
 
-def _copy_points(run):
-    """The points the scene names, those inside the box, to `seeds.ply`. Returns the names of the files written."""
-    if not run.config.source.points:
+def _write_points(run, frames, box):
+    """The points the scene or the layout has, those inside the box, to `seeds.ply`. Returns the files written.
+
+    box: (2, 3) corners, input units.
+    """
+    from taichi_edges.exporters.ply import write_float_vertices
+    from taichi_edges.readers.points import inside_box, read_points
+
+    if run.config.source.points:
+        points = read_points(run.data_path(run.config.source.points, "source.points"), box)
+    else:
+        points = inside_box(frames.points, box) if frames is not None and _has_points(frames) else []
+    if len(points) == 0:
         run.path("seeds.ply").unlink(missing_ok=True)  # of an older run with other settings
         return []
-    from taichi_edges.exporters.ply import write_float_vertices
-    from taichi_edges.readers.points import read_points
-
-    points = read_points(run.data_path(run.config.source.points, "source.points"), run.config.box)
     write_float_vertices(run.path("seeds.ply"), ("x", "y", "z"), points)
     return ["seeds.ply"]
 
@@ -235,7 +308,8 @@ def _prepare_synthetic(run):
         views = _detected_in_pictures(run, views)
     write_edges(run.path("truth.json"), part.edges, {"part": part.name})
     facts = _finish_views(run, views)
-    return {"part": part.name, **facts, "files": ["truth.json", *files, *facts["files"]]}
+    points = _write_points(run, None, UNIT_CUBE)
+    return {"part": part.name, **facts, "files": ["truth.json", *files, *facts["files"], *points]}
 
 
 def train(run):
@@ -277,10 +351,11 @@ def _start(run, views, generator):
         voted = voted_gaussians(views, config.edge_threshold, config.gaussians, config.initial_opacity, generator)
         if voted is not None:
             return voted
-        seeds, instead = ("points", "source.points") if run.config.source.points else ("random", "random points")
+        seeds = "points" if run.path("seeds.ply").is_file() else "random"
+        instead = {"points": "the given points", "random": "random points"}[seeds]
         found = f"the views agree on an edge in fewer than {LEAST_VOTED} places"
         run.progress.warn(f"{found}; the training starts from {instead} instead")
-    if seeds == "points":
+    if seeds == "points" or (seeds == "auto" and run.path("seeds.ply").is_file()):
         given = stack_fields(read_vertices(run.path("seeds.ply"), ("x", "y", "z")), ("x", "y", "z"))
         points = given_points(views.similarity.to_unit(given.astype(np.float64)), config.gaussians, generator)
     else:
@@ -289,8 +364,8 @@ def _start(run, views, generator):
 
 
 def seed_files(run):
-    """The points that training starts from, where the scene names some."""
-    return [run.path("seeds.ply")] if run.config.source.points else []
+    """The points that training may start from, where the scene or the layout has some."""
+    return [run.path("seeds.ply")]
 
 
 def _write_csv(path, rows):
@@ -443,9 +518,12 @@ def _scan_maps(run, views, held_out):
         return dict(zip(names, [*views.edge_maps, *held_out.edge_maps], strict=True))
     if source.reader == "synthetic":
         raise UserError("evaluation.scan.edges: a synthetic scene has no folders of maps; leave it out")
+    from taichi_edges.readers.frames import chosen_frames
     from taichi_edges.readers.images import read_edge_maps
+    from taichi_edges.readers.undistortion import undistorted_frames
 
-    frames = _frames(run, source.model_copy(update={"edges": folder}))
+    frames, made = chosen_frames(_listed_frames(run, edges=folder), source.skip), run.path("undistorted_for_scan")
+    frames = undistorted_frames(frames, made, source.max_size, source.gamma, run.threads, run.progress)
     maps = dict(zip(frames.names, read_edge_maps(frames, run.progress, run.threads), strict=True))
     if next(iter(maps.values())).shape != views.edge_maps.shape[1:]:
         problem = f"its maps are not {views.width} x {views.height} px as the scene's views are"
@@ -493,10 +571,7 @@ def picture_files(run):
     source = run.config.source
     if source.reader == "synthetic":
         return []
-    from taichi_edges.readers import READERS
-
-    frames = READERS[source.reader](run.data_path(source.path, "source.path"), source)
-    return [Path(path) for path in frames.image_paths if Path(path).is_file()]
+    return [Path(path) for path in _listed_frames(run).image_paths if path and Path(path).is_file()]
 
 
 def source_files(run):
@@ -506,11 +581,10 @@ def source_files(run):
     models = [_model_file(run)] if source.detector == "onnx" else []
     if source.reader == "synthetic":
         return [*points, *models]
-    from taichi_edges.readers import READERS
-
-    frames = READERS[source.reader](run.data_path(source.path, "source.path"), source)
-    paths = [Path(path) for path in (*frames.edge_paths, *frames.image_paths) if path]
-    return [frames.where, *sorted({path for path in paths if path.is_file()}), *points, *models]
+    frames = _listed_frames(run)
+    paths = {Path(path) for path in (*frames.edge_paths, *frames.image_paths, *frames.mask_paths) if path}
+    own = dict.fromkeys(path for path in (frames.where, *frames.files) if path.is_file())
+    return [*own, *sorted(path for path in paths if path.is_file()), *points, *models]
 
 
 def _model_file(run):
@@ -539,10 +613,7 @@ def _scan_map_files(run):
     source, config = run.config.source, run.config.evaluation
     if config.kind != "scan" or not config.scan.edges or source.reader == "synthetic":
         return []
-    from taichi_edges.readers import READERS
-
-    source = source.model_copy(update={"edges": config.scan.edges})
-    frames = READERS[source.reader](run.data_path(source.path, "source.path"), source)
+    frames = _listed_frames(run, edges=config.scan.edges)
     return [Path(path) for path in frames.edge_paths if path and Path(path).is_file()]
 
 

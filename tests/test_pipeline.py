@@ -786,3 +786,44 @@ def test_temporary_files_of_the_dead_are_removed_and_those_of_the_living_stay(tm
         assert {path.name for path in tmp_path.iterdir()} == {names[1], "views.npz"}
     finally:
         living.communicate(b"\n")
+
+
+# --------------------------------------------------------------------------------------------------- two runs at once
+
+HOLDER = """
+import sys
+from pathlib import Path
+from taichi_edges.artefacts import locked
+
+with locked(Path(sys.argv[1])):
+    print("locked", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def holder(copied):
+    """A process that holds the lock of the copied run, as another run would."""
+    arguments = [sys.executable, "-c", HOLDER, str(copied[2])]
+    with subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        assert process.stdout.readline() == "locked\n"
+        yield process
+        process.kill()
+
+
+def test_a_second_run_into_the_same_folder_is_refused(copied, holder):
+    message = refused(copied)
+    assert f"another run, process {holder.pid}, is writing into this folder; wait for it" in message
+
+
+def test_the_lock_of_a_dead_run_is_taken_over(copied, holder):
+    holder.kill()
+    holder.wait()
+    _, said = rerun(copied)
+    assert said.states() == states([], STAGES)
+
+
+def test_show_without_a_display_is_refused_before_anything_is_done(tmp_path):
+    message = refuse(command("scenes/demo.yaml", tmp_path, "--show"), DISPLAY="", WAYLAND_DISPLAY="")
+    assert "there is no display" in message
+    assert list(tmp_path.iterdir()) == []

@@ -13,7 +13,16 @@ from taichi_edges.views import Views
 ORTHONORMAL_TOLERANCE = 1e-3  # largest deviation of R^T R from the identity; files store six digits or more
 BOX_GRID = 9  # points along each side of the scene box that are looked for in every view
 OFF_CENTRE = 0.25  # of the image's size: a principal point farther from the centre is worth a warning
-PER_VIEW = ("names", "edge_paths", "image_paths", "intrinsics", "camera_to_world", "mask_paths", "lenses")
+PER_VIEW = (
+    "names",
+    "edge_paths",
+    "image_paths",
+    "intrinsics",
+    "camera_to_world",
+    "mask_paths",
+    "valid_paths",
+    "lenses",
+)
 LEAVE_OUT = "or leave such views out with source.skip"
 TAIL_BYTES = 64  # some writers pad the file behind its end marker
 # What a whole file ends with; a decoder alone may fill the missing rows of a truncated file with grey.
@@ -25,9 +34,16 @@ class Frames:
     """Views as a layout describes them.
 
     where: the file that lists them, for messages. names: (V,). edge_paths, image_paths: (V,) paths, an image may be
-    missing. intrinsics: (V,) functions (width, height) in pixels -> (3, 3), pixel centres at integers.
-    camera_to_world: (V, 4, 4) as in the file. Both are checked when the views to skip are gone. opengl: are those
-    OpenGL axes? size: (width, height) if the file says so. input_to_truth: (4, 4).
+    missing. intrinsics: (V,) functions (width, height) in pixels -> (3, 3), pixel centres at integers; nobody asks
+    that of a view with a lens. camera_to_world: (V, 4, 4) as in the file. Both are checked when the views to skip are
+    gone. opengl: are those OpenGL axes? size: (width, height) if the file says so. input_to_truth: (4, 4).
+
+    lenses: (V,) photogrammetry.Lens where the layout knows one, else None; its pictures are undistorted before anything
+    looks at them. mask_paths: (V,) images that show 128 or more where the picture counts, '' for all of it.
+    valid_paths: (V,) images that are 0 where undistortion left nothing, '' where it left no such place. points: (n, 3)
+    of structure from motion, input units, None where the layout has none. box: (2, 3) corners of the scene, input
+    units, where the layout knows or can tell. files: what the reader read beyond `where`. notes, warnings: what it has
+    to say about it.
     """
 
     where: Path
@@ -39,15 +55,19 @@ class Frames:
     opengl: bool
     size: tuple | None = None
     input_to_truth: np.ndarray = field(default_factory=lambda: np.eye(4))
-    mask_paths: list = ()
     lenses: list = ()
+    mask_paths: list = ()
+    valid_paths: list = ()
     points: np.ndarray | None = None
     box: np.ndarray | None = None
+    files: tuple = ()
+    notes: tuple = ()
+    warnings: tuple = ()
 
     def __post_init__(self):
-        for key in ("mask_paths", "lenses"):
+        for key, nothing in (("lenses", None), ("mask_paths", ""), ("valid_paths", "")):
             if not getattr(self, key):
-                object.__setattr__(self, key, [None if key == "lenses" else ""] * len(self.names))
+                object.__setattr__(self, key, [nothing] * len(self.names))
 
 
 def read_json(path, what):
@@ -198,8 +218,13 @@ def _check_intrinsics(frames, intrinsics, width, height, progress):
 
 def folders_beside(frames):
     """The folders next to the file that lists the frames, in words."""
-    folders = sorted(p.name for p in frames.where.parent.iterdir() if p.is_dir())
-    return name_some(folders, 8) or "no folders"
+    return folders_in(frames.where.parent)
+
+
+def folders_in(folder):
+    """The folders in a folder, in words."""
+    names = sorted(p.name for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
+    return name_some(names, 8) or "no folders"
 
 
 def is_whole(path):
