@@ -271,7 +271,8 @@ class EvaluationConfig(Section):
 
     truth: str = Field("", description="ABC folder, PLY or edge JSON, relative to the data root; '': there is none")
     kind: Literal["edges", "scan"] = Field(
-        "edges", description="what truth holds: edges, or the points of a scanned surface, those on edges being the truth"
+        "edges",
+        description="what truth holds: edges, or the points of a scanned surface, those on edges being the truth",
     )
     scan: ScanConfig = ScanConfig()
     held_out: Annotated[str | int | list[str], _measured_or(_is_held_out, "a number, or a list of names, of views")] = (

@@ -26,6 +26,7 @@ REACH_PX = (
 # but neither hidden
 SPACING_PX = 0.75  # of the samples of a projected edge: edgels are about 1 px apart
 PLACE_PX = 4.0  # between the places of an edge that the views are asked about, at the middle of the scene box
+MOST_PLACES = 20_000  # of all edges; where these are longer, the places are farther apart
 NEIGHBORS = 8  # views nearest by direction that say whether a place is visible from there, by angle^-2 each,
 VISIBLE = 0.7  # and how much of their weight must see it: of the true edges of synthetic parts, one in twenty of the
 # places that are hidden passes, and three in four of those that are visible
@@ -175,7 +176,8 @@ def held_out_metrics(polylines, training, held_out):
     scores = []
     chords = Chords.of(polylines)
     if len(held_out):
-        places, tangents, ends = chords.places(PLACE_PX * pixel_size(training))
+        spacing = max(PLACE_PX * pixel_size(training), chords.travelled[-1] / MOST_PLACES)
+        places, tangents, ends = chords.places(spacing)
         sightings = Sightings.of(places, tangents, training)
         scores = [score_view(chords, ends, sightings, held_out, view) for view in range(len(held_out))]
     return {"held_out_views": len(held_out), **metrics_of(scores)}
