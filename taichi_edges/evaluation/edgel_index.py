@@ -17,7 +17,7 @@ MOST_WINDING = np.pi  # length of a long edge by its extent: that of a full circ
 class EdgelIndex:
     """The edgels of one view, to be looked up by pixel.
 
-    points, normals: (e, 2) float32 of the view's edgels. order: (e,) int32 indices, pixel by pixel. starts: (H * W + 1,)
+    points, normals: (e, 2) float32, of the edgels. order: (e,) int32 indices, pixel by pixel. starts: (H * W + 1,)
     int32, where in `order` each pixel begins. size: (width, height), pixels.
     """
 
