@@ -172,6 +172,18 @@ def test_texture_has_no_long_edges_but_lines_and_circles_are(generator):
     assert long[360:].mean() < 0.2  # strokes that happen to continue each other
 
 
+def test_many_chains_in_a_large_image_are_told_apart():
+    """More chains times pixels than 32 bits can count."""
+    corners = np.stack(np.meshgrid(np.arange(20.0, 1900, 60), np.arange(20.0, 1990, 20)), axis=-1).reshape(-1, 1, 2)
+    points = (corners + np.arange(40)[:, None] * [1.0, 0.0]).reshape(-1, 2)
+    short = np.arange(len(points)) % 40 >= 20
+    short &= np.arange(len(points)) >= len(points) // 2
+    points = points[~short]
+    long = EdgelIndex.of(points, np.tile([0.0, 1.0], (len(points), 1)), 2000, 2000).on_long_edges()
+    whole = np.arange(len(points)) < np.count_nonzero(~short[: len(short) // 2])
+    np.testing.assert_array_equal(long, whole)
+
+
 # --------------------------------------------------------------------------------------------------------- visibility
 
 

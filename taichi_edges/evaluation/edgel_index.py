@@ -87,7 +87,7 @@ class EdgelIndex:
         """(c,) pixels that each chain covers, and (c,) px of the diagonal of its bounding box. chains: (e,) int."""
         columns, rows = np.clip(np.rint(self.points.T).astype(np.int64), 0, np.array(self.size)[:, None] - 1)
         pixels = self.size[0] * self.size[1]
-        covered = np.unique(chains * pixels + rows * self.size[0] + columns) // pixels
+        covered = np.unique(chains.astype(np.int64) * pixels + rows * self.size[0] + columns) // pixels
         low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
         np.minimum.at(low, chains, self.points)
         np.maximum.at(high, chains, self.points)
