@@ -25,7 +25,7 @@ Point = Annotated[list[float], Field(min_length=3, max_length=3)]
 Box = Annotated[list[Point], Field(min_length=2, max_length=2)]
 
 
-WITH_POINTS = ("colmap", "images", "nerfstudio")  # readers of layouts that may hold points of their own
+WITH_POINTS = ("auto", "colmap", "images", "nerfstudio")  # readers of layouts that may hold points of their own
 MOST_BIAS = 20.0  # px; a map that is farther off belongs to another image
 
 
@@ -158,7 +158,7 @@ class TrainConfig(Section):
     seeds: Literal["auto", "random", "points", "votes"] = Field(
         "auto",
         description="random points in the box; points: source.points or the model's; votes: where many views agree on"
-        " an edge; auto: points if there are any, else random",
+        " an edge; auto: points as far as there are any, else random",
     )
     initial_scale: Positive = Field(0.004, description="standard deviation, unit-cube units")
     initial_opacity: Annotated[float, Field(gt=0, lt=1)] = Field(0.08)

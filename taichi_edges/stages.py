@@ -38,27 +38,22 @@ def prepare(run):
         return _prepare_synthetic(run)
     from taichi_edges.detectors import DETECTORS, choose_detector
     from taichi_edges.readers.frames import build_views, camera_poses, chosen_frames
-    from taichi_edges.readers.undistortion import undistorted_frames
 
     source = run.config.source
-    frames = _listed_frames(run)
+    frames = _posed_frames(run, chosen_frames(_listed_frames(run), source.skip))
     _pass_on(frames, run.progress)
-    frames = chosen_frames(frames, source.skip)
     camera_poses(frames)  # a mistake in them shall not wait for the detector
-    box, box_from = _scene_box(run.config, frames)
+    box, box_from = _scene_box(run, frames)
     _refuse_missing_points(run, frames)
     detector = choose_detector(source, frames)
     _refuse_needless_calibration(run, detector)
-    frames = undistorted_frames(
-        frames, run.path("undistorted"), source.max_size, source.gamma, run.threads, run.progress
-    )
+    frames = _undistorted(run, frames, box if box_from == "reader" else None)
     frames, edge_maps, edgels = DETECTORS[detector](frames, run)
     views = _inside_the_run(run, build_views(frames, edge_maps, edgels, source, box, run.progress))
-    facts = _finish_views(run, views, frames)
+    facts = {"detector": detector, "box": np.array(box).tolist(), "box_from": box_from}
+    facts |= _finish_views(run, views, frames)
     own = [path for path in views.image_paths if path and not Path(path).is_absolute()]
-    points = _write_points(run, frames, box)
-    about_box = {"box": np.asarray(box, dtype=float).tolist(), "box_from": box_from}
-    return {"detector": detector, **about_box, **facts, "files": [*own, *facts["files"], *points]}
+    return {**facts, "files": [*own, *facts["files"], *_write_points(run, frames, box)]}
 
 
 def _listed_frames(run, **changed):
@@ -69,6 +64,17 @@ def _listed_frames(run, **changed):
     return READERS[source.reader](run.data_path(source.path, "source.path"), source)
 
 
+def _posed_frames(run, frames):
+    """The frames themselves; photographs without poses after structure from motion."""
+    source = run.config.source
+    if source.reader != "images":
+        return frames
+    from taichi_edges.readers.photos import posed_photos
+
+    folder = run.data_path(source.path, "source.path")
+    return posed_photos(frames, folder, source, run.path("sfm"), run.config.seed, run.threads, run.progress)
+
+
 def _pass_on(frames, progress):
     """Tell the user what the reader has to say."""
     for note in frames.notes:
@@ -77,16 +83,30 @@ def _pass_on(frames, progress):
         progress.warn(warning)
 
 
-def _scene_box(config, frames):
+def _scene_box(run, frames):
     """(2, 3) corners of the scene, input units, and where they are from."""
-    if config.box != "auto":
-        return config.box, "scene"
+    if run.config.box != "auto":
+        return run.config.box, "scene"
     if frames.box is not None:
+        corners = " to ".join("(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in frames.box)
+        run.progress.say(
+            f"scene box {corners}, in units of the cameras, as the layout has it; the key box sets another"
+        )
         return frames.box, "reader"
     if frames.points is not None:
         found = f"{len(frames.points)} points fit well enough to tell where the scene is"
         raise UserError(f"{frames.where}: only {found}; set box, or raise source.max_point_error")
     return UNIT_CUBE, "unit cube"
+
+
+def _undistorted(run, frames, guessed_box):
+    """The frames as pinhole cameras would have taken them; without those that do not see a box nobody has set."""
+    from taichi_edges.readers.frames import frames_in_sight
+    from taichi_edges.readers.undistortion import undistorted_frames
+
+    source, folder = run.config.source, run.path("undistorted")
+    frames = undistorted_frames(frames, folder, source.max_size, source.gamma, run.threads, run.progress)
+    return frames if guessed_box is None else frames_in_sight(frames, guessed_box, source.axes, run.progress)
 
 
 def _refuse_missing_points(run, frames):
@@ -355,11 +375,14 @@ def _start(run, views, generator):
         instead = {"points": "the given points", "random": "random points"}[seeds]
         found = f"the views agree on an edge in fewer than {LEAST_VOTED} places"
         run.progress.warn(f"{found}; the training starts from {instead} instead")
-    if seeds == "points" or (seeds == "auto" and run.path("seeds.ply").is_file()):
+    if seeds == "random" or not run.path("seeds.ply").is_file():
+        points = random_points(config.gaussians, views.box, generator)
+    else:
         given = stack_fields(read_vertices(run.path("seeds.ply"), ("x", "y", "z")), ("x", "y", "z"))
         points = given_points(views.similarity.to_unit(given.astype(np.float64)), config.gaussians, generator)
-    else:
-        points = random_points(config.gaussians, views.box, generator)
+        if seeds == "auto":  # structure from motion finds few points where there is no texture
+            more = random_points(config.gaussians - len(points), views.box, generator)
+            points = np.concatenate([points, more])
     return start_gaussians(points, generator, config.initial_scale, config.initial_opacity)
 
 

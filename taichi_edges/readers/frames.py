@@ -12,6 +12,7 @@ from taichi_edges.views import Views
 
 ORTHONORMAL_TOLERANCE = 1e-3  # largest deviation of R^T R from the identity; files store six digits or more
 BOX_GRID = 9  # points along each side of the scene box that are looked for in every view
+MOST_SEE = 0.5  # share of the views that must see a box for it to be about right
 OFF_CENTRE = 0.25  # of the image's size: a principal point farther from the centre is worth a warning
 PER_VIEW = (
     "names",
@@ -249,6 +250,24 @@ def _usable_images(frames, progress):
         problem = "is missing or truncated; their overlays show the edge map instead"
         progress.warn(f"{len(lost)} of {len(wanted)} views: the colour image {problem}: {name_some(lost)}")
     return [str(path) if ok else "" for path, ok in zip(wanted, usable, strict=True)]
+
+
+def frames_in_sight(frames, box, axes, progress):
+    """The frames that see some of a box that nobody has set by hand; a few that do not are named in a warning.
+
+    box: (2, 3) corners, input units. axes: `source.axes`. Where most see nothing, something else is wrong.
+    """
+    if frames.size is None:
+        return frames
+    opengl = frames.opengl if axes == "auto" else axes == "opengl"
+    poses = camera_poses(frames) @ (OPENGL_TO_OPENCV if opengl else np.eye(4))
+    intrinsics = np.stack([intrinsics_for(*frames.size) for intrinsics_for in frames.intrinsics])
+    seeing = _views_that_see(np.asarray(box, dtype=np.float64), intrinsics, invert_pose(poses), frames.size)
+    if seeing.all() or seeing.mean() < MOST_SEE:
+        return frames
+    lost = [name for name, sees in zip(frames.names, seeing, strict=True) if not sees]
+    progress.warn(f"{len(lost)} of {len(seeing)} views see nothing of the scene box, left out: {name_some(lost)}")
+    return subset(frames, np.flatnonzero(seeing))
 
 
 def _check_box_seen(frames, intrinsics, poses, box, size, opengl):
