@@ -1,12 +1,14 @@
 """Pseudo ground truth from a scan: of a synthetic one, whose edges are known, the points on edges must be these."""
 
+import json
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from taichi_edges.cameras import Similarity
+from taichi_edges.cameras import Similarity, invert_pose
 from taichi_edges.detectors.ridges import trace_ridges
 from taichi_edges.edge_set import write_edges
 from taichi_edges.errors import UserError
@@ -19,6 +21,7 @@ from taichi_edges.exporters.ply import read_vertices, write_float_vertices
 from taichi_edges.pipeline import Run
 from taichi_edges.scene_file import check_scene
 from taichi_edges.stages import evaluate as evaluate_stage
+from taichi_edges.stages import truth_files
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import Imperfections, pixel_size, render_edge_maps, ring_cameras
 from taichi_edges.synthetic.visibility import LIFT, ray_scene
@@ -126,7 +129,29 @@ def test_the_stage_scores_against_a_scan_in_the_frame_of_the_input(scanned, tmp_
     assert np.median(dense_curves(exact_polylines(part.edges)).distances(points)) < 0.003
 
 
-def stage_folder(folder, part, cameras, maps, similarity):
+def test_a_scan_can_be_judged_by_other_maps_than_the_scenes(scanned, tmp_path):
+    """The scene's own maps are blank; those of the folder that the scene names for the scan are not."""
+    part, cameras, maps, scan = scanned
+    frames = []
+    (tmp_path / "data/edge_other").mkdir(parents=True)
+    for view, (lens, pose) in enumerate(zip(*cameras, strict=True)):
+        cv2.imwrite(str(tmp_path / f"data/edge_other/v{view}.png"), maps[view])
+        to_world = invert_pose(np.vstack([pose, [0, 0, 0, 1]]))
+        camera = {"camtoworld": [*to_world.tolist(), [0, 0, 0, 1]], "intrinsics": lens.tolist()}
+        frames.append({"rgb_path": f"v{view}.png", **camera})
+    (tmp_path / "data/meta_data.json").write_text(json.dumps({"frames": frames}))
+    run = stage_folder(tmp_path, part, cameras, np.zeros_like(maps), Similarity(), str(tmp_path / "data"))
+    write_float_vertices(tmp_path / "scan.ply", ("x", "y", "z"), scan)
+    with pytest.raises(UserError, match="no point lies on edges"):
+        evaluate_stage(run)
+    scene = run.config.model_dump()
+    scene["evaluation"]["scan"]["edges"] = "edge_other"
+    run = Run(check_scene(scene, "the test"), tmp_path)
+    assert evaluate_stage(run)["recall_5mm_percent"] > 95
+    assert {path.name for path in truth_files(run)} == {"scan.ply", *(f"v{view}.png" for view in range(VIEWS))}
+
+
+def stage_folder(folder, part, cameras, maps, similarity, source="x"):
     """A Run whose earlier stages are done: views without edgels, one of them held out, and the true edges."""
     names = tuple(f"v{view}" for view in range(VIEWS))
     edgels = trace_ridges(maps, 2.5, 0.3, 2)
@@ -134,7 +159,7 @@ def stage_folder(folder, part, cameras, maps, similarity):
     for name, some in zip(("views.npz", "held_out.npz"), split_views(views, [5]), strict=True):
         write_views(folder / name, some)
     write_edges(folder / "edges.json", part.edges.transformed(similarity.to_input), {})
-    scene = {"source": {"reader": "emap", "path": "x"}}
+    scene = {"source": {"reader": "emap", "path": source}}
     scene["evaluation"] = {"truth": str(folder / "scan.ply"), "kind": "scan", "scan": {"threshold": THRESHOLD}}
     return Run(check_scene(scene, "the test"), folder)
 
