@@ -26,6 +26,7 @@ from taichi_edges.wireframe import read_wireframe, write_wireframe
 
 WIDEST_PX = 40.0  # of a detector's lines
 UNIT_CUBE = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+WRONG_CAMERAS = "poses or intrinsics may not be those of these images (their order, axes or scale)"
 CALIBRATION_SEEDS = 4000  # 3D points through which a detector's biases are measured, at most
 
 
@@ -34,7 +35,8 @@ def prepare(run):
     if run.config.source.reader == "synthetic":
         return _prepare_synthetic(run)
     from taichi_edges.detectors import DETECTORS, choose_detector
-    from taichi_edges.readers.frames import build_views, camera_poses, chosen_frames
+    from taichi_edges.readers.frames import build_views, camera_poses, check_before_detection, chosen_frames
+    from taichi_edges.readers.images import refuse_copies
     from taichi_edges.readers.undistortion import undistorted_frames
 
     source = run.config.source
@@ -43,14 +45,17 @@ def prepare(run):
     frames = chosen_frames(frames, source.skip)
     camera_poses(frames)  # a mistake in them shall not wait for the detector
     box, box_from = _scene_box(run.config, frames)
+    given_box = box_from == "scene"
+    check_before_detection(frames, source, box, given_box)
     _refuse_missing_points(run, frames)
+    refuse_copies(frames, run.progress)
     detector = choose_detector(source, frames)
     _refuse_needless_calibration(run, detector)
     frames = undistorted_frames(
         frames, run.path("undistorted"), source.max_size, source.gamma, run.threads, run.progress
     )
     frames, edge_maps, edgels = DETECTORS[detector](frames, run)
-    views = _inside_the_run(run, build_views(frames, edge_maps, edgels, source, box, run.progress))
+    views = _inside_the_run(run, build_views(frames, edge_maps, edgels, source, box, run.progress, given_box))
     facts = _finish_views(run, views, frames)
     own = [path for path in views.image_paths if path and not Path(path).is_absolute()]
     points = _write_points(run, frames, box)
@@ -329,7 +334,7 @@ def _start(run, views, generator):
         seeds = "points" if run.path("seeds.ply").is_file() else "random"
         instead = {"points": "the given points", "random": "random points"}[seeds]
         found = f"the views agree on an edge in fewer than {LEAST_VOTED} places"
-        run.progress.warn(f"{found}; the training starts from {instead} instead")
+        run.progress.warn(f"{found}: {WRONG_CAMERAS}; the training starts from {instead} instead")
     if seeds == "points" or (seeds == "auto" and run.path("seeds.ply").is_file()):
         given = stack_fields(read_vertices(run.path("seeds.ply"), ("x", "y", "z")), ("x", "y", "z"))
         points = given_points(views.similarity.to_unit(given.astype(np.float64)), config.gaussians, generator)
