@@ -55,9 +55,9 @@ class Stage:
 STAGES = {
     "prepare": Stage(
         stages.prepare,
-        ("source", "calibration", "box", "seed", "train.edge_threshold"),
+        ("source", "calibration", "box", "seed", "train.edge_threshold", "evaluation.held_out"),
         (),
-        ("views.npz",),
+        ("views.npz", "held_out.npz"),
         stages.source_files,
     ),
     "train": Stage(
@@ -82,7 +82,7 @@ STAGES = {
     "evaluate": Stage(
         stages.evaluate,
         ("evaluation",),
-        ("edges.json", "views.npz"),
+        ("edges.json", "views.npz", "held_out.npz"),
         ("metrics.json", "metrics.csv"),
         stages.truth_files,
     ),

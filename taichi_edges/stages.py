@@ -31,22 +31,31 @@ CALIBRATION_SEEDS = 4000  # 3D points through which a detector's biases are meas
 
 
 def prepare(run):
-    """Source -> `views.npz` and `detection.png`; of synthetic scenes also `truth.json` and pictures in `images/`."""
+    """Source -> `views.npz`, `held_out.npz` (views for the evaluation alone) and `detection.png`.
+
+    Of synthetic scenes also `truth.json` and pictures in `images/`.
+    """
     if run.config.source.reader == "synthetic":
         return _prepare_synthetic(run)
     from taichi_edges.detectors import DETECTORS, choose_detector
-    from taichi_edges.readers.frames import build_views, camera_poses, check_before_detection, chosen_frames
+    from taichi_edges.readers.frames import (
+        build_views,
+        camera_poses,
+        check_before_detection,
+        chosen_frames,
+        frames_in_sight,
+    )
     from taichi_edges.readers.images import refuse_copies
     from taichi_edges.readers.undistortion import undistorted_frames
 
     source = run.config.source
-    frames = _listed_frames(run)
+    frames = _posed_frames(run, chosen_frames(_listed_frames(run), source.skip))
     _pass_on(frames, run.progress)
-    frames = chosen_frames(frames, source.skip)
     camera_poses(frames)  # a mistake in them shall not wait for the detector
-    box, box_from = _scene_box(run.config, frames)
-    given_box = box_from == "scene"
-    check_before_detection(frames, source, box, given_box)
+    box, box_from = _scene_box(run, frames)
+    if box_from == "reader":
+        frames = frames_in_sight(frames, source, box, run.progress)
+    check_before_detection(frames, source, box)
     _refuse_missing_points(run, frames)
     refuse_copies(frames, run.progress)
     detector = choose_detector(source, frames)
@@ -55,7 +64,7 @@ def prepare(run):
         frames, run.path("undistorted"), source.max_size, source.gamma, run.threads, run.progress
     )
     frames, edge_maps, edgels = DETECTORS[detector](frames, run)
-    views = _inside_the_run(run, build_views(frames, edge_maps, edgels, source, box, run.progress, given_box))
+    views = _inside_the_run(run, build_views(frames, edge_maps, edgels, source, box, run.progress))
     facts = _finish_views(run, views, frames)
     own = [path for path in views.image_paths if path and not Path(path).is_absolute()]
     points = _write_points(run, frames, box)
@@ -71,6 +80,17 @@ def _listed_frames(run):
     return READERS[source.reader](run.data_path(source.path, "source.path"), source)
 
 
+def _posed_frames(run, frames):
+    """The frames themselves; photographs without poses after structure from motion."""
+    source = run.config.source
+    if source.reader != "images":
+        return frames
+    from taichi_edges.readers.photos import posed_photos
+
+    folder = run.data_path(source.path, "source.path")
+    return posed_photos(frames, folder, source, run.path("sfm"), run.config.seed, run.threads, run.progress)
+
+
 def _pass_on(frames, progress):
     """Tell the user what the reader has to say."""
     for note in frames.notes:
@@ -79,11 +99,15 @@ def _pass_on(frames, progress):
         progress.warn(warning)
 
 
-def _scene_box(config, frames):
+def _scene_box(run, frames):
     """(2, 3) corners of the scene, input units, and where they are from."""
-    if config.box != "auto":
-        return config.box, "scene"
+    if run.config.box != "auto":
+        return run.config.box, "scene"
     if frames.box is not None:
+        corners = " to ".join("(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in frames.box)
+        run.progress.say(
+            f"scene box {corners}, in units of the cameras, as the layout has it; the key box sets another"
+        )
         return frames.box, "reader"
     if frames.points is not None:
         found = f"{len(frames.points)} points fit well enough to tell where the scene is"
@@ -122,25 +146,31 @@ def _refuse_needless_calibration(run, detector):
 
 
 def _finish_views(run, views, frames=None):
-    """Trace and calibrate the edgels where the detector gave maps, write `views.npz` and the report; the facts.
+    """Trace and calibrate the edgels where the detector gave maps, write the views and the report; the facts.
 
     frames: whose masks drop edgels; None where there are none.
     """
-    facts = {"views": len(views), "width_px": views.width, "height_px": views.height}
-    residuals, traced_here = {}, views.edgels is None
+    from taichi_edges.evaluation.held_out import choose_held_out, split_views
+
+    facts, residuals = {"width_px": views.width, "height_px": views.height}, {}
+    traced_here = views.edgels is None
     if traced_here:
         views, width = _traced(run, views)
         facts["line_width_px"] = round(width, 2)
     if frames is not None:
         views, dropped = _masked(run, views, frames, redraw=not traced_here)
         facts |= {} if dropped is None else {"masked_edgels": dropped}
+    views, held_out = split_views(views, choose_held_out(views.names, run.config.evaluation.held_out))
+    facts = {"views": len(views), "held_out": list(held_out.names), **facts}
     if traced_here:
         views, calibration = _calibrated(run, views)
         if calibration is not None:
+            held_out = _corrected(run, held_out, calibration)
             facts["calibration"] = calibration.facts()
             residuals = {"residuals": calibration.residuals, "on_silhouette": calibration.on_silhouette}
     facts["edgels"] = len(views.edgels)
     write_views(run.path("views.npz"), views)
+    write_views(run.path("held_out.npz"), held_out)
     return {**facts, "files": [_write_sheet(run, views, residuals)]}
 
 
@@ -232,6 +262,18 @@ def _calibrate(run, views, thin):
     return calibrate(
         with_whole_paths(run, views), views.edgels, seeds.points, seeds.directions, shift, silhouette, run.threads
     )
+
+
+def _corrected(run, views, calibration):
+    """Views that the calibration has not seen, their edgels without the biases that it found in others."""
+    from taichi_edges.detectors.calibration import sides_of
+
+    if not len(views) or not (calibration.shift_applied or calibration.silhouette_applied):
+        return views
+    silhouette, shift = calibration.silhouette_applied * calibration.silhouette, calibration.shift
+    values = np.array([silhouette, *(calibration.shift_applied * shift)])
+    sides = sides_of(with_whole_paths(run, views), views.edgels, run.threads)
+    return replace(views, edgels=sides.correct(views.edgels, values)[0])
 
 
 def _write_sheet(run, views, residuals):
@@ -335,11 +377,14 @@ def _start(run, views, generator):
         instead = {"points": "the given points", "random": "random points"}[seeds]
         found = f"the views agree on an edge in fewer than {LEAST_VOTED} places"
         run.progress.warn(f"{found}: {WRONG_CAMERAS}; the training starts from {instead} instead")
-    if seeds == "points" or (seeds == "auto" and run.path("seeds.ply").is_file()):
+    if seeds == "random" or not run.path("seeds.ply").is_file():
+        points = random_points(config.gaussians, views.box, generator)
+    else:
         given = stack_fields(read_vertices(run.path("seeds.ply"), ("x", "y", "z")), ("x", "y", "z"))
         points = given_points(views.similarity.to_unit(given.astype(np.float64)), config.gaussians, generator)
-    else:
-        points = random_points(config.gaussians, views.box, generator)
+        if seeds == "auto":  # structure from motion finds few points where there is no texture
+            more = random_points(config.gaussians - len(points), views.box, generator)
+            points = np.concatenate([points, more])
     return start_gaussians(points, generator, config.initial_scale, config.initial_opacity)
 
 
@@ -446,21 +491,25 @@ def truth_path(run):
 def evaluate(run):
     """`edges.json` -> `metrics.json` and `metrics.csv`: EMAP's protocol, corners, free ends; without a truth fewer.
 
-    Lengths are in the frame of the truth, in the unit cube where there is none.
+    And what the held-out views say. Lengths are in the frame of the truth, in the unit cube where there is none.
     """
     from taichi_edges.evaluation.ground_truth import read_ground_truth
+    from taichi_edges.evaluation.held_out import held_out_metrics
     from taichi_edges.evaluation.metrics import evaluate as measure
-    from taichi_edges.evaluation.metrics import measure_alone
+    from taichi_edges.evaluation.metrics import exact_polylines, measure_alone
 
     edges, _ = read_edges(run.path("edges.json"))
     views, path = read_views(run.path("views.npz")), truth_path(run)
+    unit = edges.transformed(views.similarity.to_unit)
     if path is None:
-        metrics = {**measure_alone(edges.transformed(views.similarity.to_unit)), "ground_truth": None}
+        metrics, source = measure_alone(unit), None
     else:
         to_truth, from_truth = views.input_to_truth, np.linalg.inv(views.input_to_truth)
         truth = read_ground_truth(path, lambda points: views.similarity.to_unit(transform(from_truth, points)))
         into_frame = partial(transform, to_truth) if truth.own_frame else views.similarity.to_unit
-        metrics = {**measure(edges.transformed(into_frame), truth), "ground_truth": truth.source}
+        metrics, source = measure(edges.transformed(into_frame), truth), truth.source
+    metrics |= held_out_metrics(exact_polylines(unit), views, read_views(run.path("held_out.npz")))
+    metrics["ground_truth"] = source
     write_json(run.path("metrics.json"), metrics)
     _write_csv(run.path("metrics.csv"), [("metric", "value"), *metrics.items()])
     return metrics

@@ -244,6 +244,27 @@ def test_few_points_give_a_box_and_fewer_none(generator):
     assert scene_box(points[:5], ring(5, 3.0, generator)) is None
 
 
+def test_views_that_look_away_from_a_box_nobody_has_set_are_left_out(tmp_path, generator):
+    """Five cameras look at the object, one turns its back on it."""
+    names = [f"{view}.png" for view in range(6)]
+    poses = np.stack([invert_pose(pose) for pose in ring(6, 4.0, generator)])
+    points = generator.uniform(-0.5, 0.5, (60, 3))
+    write_model(tmp_path / "sparse", names, [camera("PINHOLE")] * 6, poses, points)
+    poses[5, [0, 2]] *= -1  # turned about its y axis
+    model = pycolmap.Reconstruction(str(tmp_path / "sparse"))
+    model.frame(6).rig_from_world = pycolmap.Rigid3d(poses[5])
+    model.write(str(tmp_path / "sparse"))
+    (tmp_path / "images").mkdir()
+    for view, name in enumerate(names):
+        picture = cv2.rectangle(np.zeros(SIZE[::-1], np.uint8), (100 + view, 70), (220, 170), 200, -1)
+        cv2.imwrite(str(tmp_path / "images" / name), picture)
+    (tmp_path / "run").mkdir()
+    told = Told()
+    facts = stages.prepare(Run(scene(tmp_path, {"max_point_error": 1e9}), tmp_path / "run", progress=told))
+    assert facts["views"] == 5 and facts["box_from"] == "reader"
+    assert any("1 of 6 views see nothing of the scene box, left out: 5" in text for text in told.warnings)
+
+
 @pytest.fixture(scope="module")
 def part_project(tmp_path_factory):
     """A project of the block in a frame turned, moved and 40 times as large, seen through a lens with distortion.
@@ -294,6 +315,6 @@ def test_edges_come_out_in_the_frame_and_scale_of_colmap(part_project, tmp_path)
     assert (away.min(axis=0) < 0.3).mean() > 0.9
     views = read_views(run.path("views.npz"))
     assert all(not Path(path).is_absolute() and run.path(path).is_file() for path in views.image_paths)
-    assert "seeds.ply" in facts["files"]
+    assert "seeds.ply" in facts["files"] and any("scene box (" in text for text in told.notes)
     again = run_stages(Run(run.config, run.folder, threads=2), until="refine")
     assert again["ran"] == []

@@ -20,12 +20,14 @@ from taichi_edges.readers.scene_checks import (
     check_points,
     check_views,
     into_unit_cube,
+    views_in_sight,
 )
 from taichi_edges.views import Views
 
 ORTHONORMAL_TOLERANCE = 1e-3  # largest deviation of R^T R from the identity; files store six digits or more
 TURNED_FROM, TURNED_TO = 0.1, 0.3  # off the centre of the image; of that, off the centre of the turned image
 TURNED_BY_EXIF = "a program has rotated the file by its EXIF orientation; use the images that the cameras are of"
+MOST_SEE = 0.5  # share of the views that must see a box for it to be about right
 OFF_CENTRE = 0.25  # of the image's size: a principal point farther from the centre is worth a warning
 PER_VIEW = (
     "names",
@@ -111,15 +113,16 @@ def matrix(values, shape, where, key):
     return array
 
 
-def build_views(frames, edge_maps, edgels, config, box, progress, given_box=True):
+def build_views(frames, edge_maps, edgels, config, box, progress):
     """Check the cameras of frames whose edges are known, and bring the scene box into the unit cube.
 
     edge_maps: (V, H, W) uint8. edgels: Edgels, or None where they are still to be traced. config: the scene's `source`
-    section. box: (2, 3) corners, input units. given_box: by the scene, see `scene_checks.check_box`.
+    section. box: (2, 3) corners, input units.
     """
     height, width = edge_maps.shape[1:]
     intrinsics = np.stack([intrinsics_for(width, height) for intrinsics_for in frames.intrinsics])
-    cameras = check_scene(frames, intrinsics, [(width, height)] * len(intrinsics), config, box, progress, given_box)
+    cameras = _cameras(frames, intrinsics, [(width, height)] * len(intrinsics), config.axes)
+    _check_scene(frames, cameras, box, progress)
     similarity = Similarity.of_box(box)
     return Views(
         names=tuple(frames.names),
@@ -134,41 +137,61 @@ def build_views(frames, edge_maps, edgels, config, box, progress, given_box=True
     )
 
 
-def check_scene(frames, intrinsics, sizes, config, box, progress, given_box=True):
-    """The Cameras of frames; UserError where they, the box and the points cannot be those of one scene.
+def check_before_detection(frames, config, box):
+    """UserError where cameras, box and points cannot be those of one scene: that shall not wait for the detector.
 
-    intrinsics: (V, 3, 3) pixels. sizes: (V, 2) width and height, pixels. The rest as for `build_views`.
+    The intrinsics are those of lenses, or what the size of the first picture means; all is checked again when the
+    pictures are decoded. config: the scene's `source` section. box: (2, 3) corners, input units.
     """
-    opengl = frames.opengl if config.axes == "auto" else config.axes == "opengl"
-    check_views(frames)
+    cameras = _cameras_before_detection(frames, config)
+    if cameras is not None:
+        _check_scene(frames, cameras, box, Progress())
+
+
+def frames_in_sight(frames, config, box, progress):
+    """The frames that see some of a box that nobody has set by hand; a few that do not are named in a warning.
+
+    Where most see nothing, something else is wrong. config, box: as for `check_before_detection`.
+    """
+    cameras = _cameras_before_detection(frames, config)
+    seeing = np.ones(len(frames.names), bool) if cameras is None else views_in_sight(cameras, box)
+    if seeing.all() or seeing.mean() < MOST_SEE:
+        return frames
+    lost = [name for name, sees in zip(frames.names, seeing, strict=True) if not sees]
+    progress.warn(f"{len(lost)} of {len(seeing)} views see nothing of the scene box, left out: {name_some(lost)}")
+    return subset(frames, np.flatnonzero(seeing))
+
+
+def _cameras(frames, intrinsics, sizes, axes):
+    """The Cameras of frames. sizes: (V, 2) width and height, pixels. axes: `source.axes`."""
+    opengl = frames.opengl if axes == "auto" else axes == "opengl"
     poses = camera_poses(frames)
-    poses = poses @ OPENGL_TO_OPENCV if opengl else poses
-    _check_intrinsics(frames, intrinsics, np.asarray(sizes), progress)
-    cameras = Cameras(intrinsics, poses, np.asarray(sizes), opengl)
+    return Cameras(intrinsics, poses @ OPENGL_TO_OPENCV if opengl else poses, np.asarray(sizes), opengl)
+
+
+def _check_scene(frames, cameras, box, progress):
+    check_views(frames)
+    check_places(frames, cameras.poses)
+    _check_intrinsics(frames, cameras.intrinsics, cameras.sizes, progress)
     check_points(frames, cameras)
-    for warning in check_box(frames, cameras, box, given_box):
-        progress.warn(warning)
-    return cameras
+    check_box(frames, cameras, np.asarray(box, dtype=np.float64))
 
 
-def check_before_detection(frames, config, box, given_box=True):
-    """`check_scene` from what is known of the cameras before any picture is decoded: a mistake shall not wait for that.
-
-    Sizes are those of lenses, else that of the first picture; what can only be told from all of them is told later.
-    """
-    sizes, intrinsics, common = [], [], _size_of_a_picture(frames)
+def _cameras_before_detection(frames, config):
+    """The Cameras of frames of which no picture is decoded; None where no picture tells a size."""
+    common, intrinsics, sizes = _size_of_a_picture(frames), [], []
     for lens, intrinsics_for in zip(frames.lenses, frames.intrinsics, strict=True):
         if lens is None and common is None:
-            return
-        matrix_of_lens, size = undistorted_once(lens) if lens else (intrinsics_for(*common), common)
+            return None
+        matrix_of_lens, size = _undistorted(lens) if lens else (intrinsics_for(*common), common)
         intrinsics.append(matrix_of_lens)
         sizes.append(size)
-    check_scene(frames, np.stack(intrinsics), sizes, config, box, Progress(), given_box)
+    return _cameras(frames, np.stack(intrinsics), sizes, config.axes)
 
 
 @functools.lru_cache(maxsize=256)
-def undistorted_once(lens):
-    """`photogrammetry.undistorted`, of which many views share the result."""
+def _undistorted(lens):
+    """`photogrammetry.undistorted`; many views share a lens."""
     return undistorted(lens)
 
 
@@ -182,7 +205,6 @@ def camera_poses(frames):
     """(V, 4, 4) camera-to-world as the file has them; UserError where one is no rigid motion."""
     poses = np.stack([matrix(pose, (4, 4), frames.where, f"the pose of {name}") for name, pose in _each(frames)])
     _check_poses(frames, poses)
-    check_places(frames, poses)
     return poses
 
 

@@ -17,6 +17,7 @@ from taichi_edges.readers.frames import (
     subset,
 )
 
+MASK_KEEPS = 128  # of 255, from here on
 MOSTLY_EDGES = 0.5  # share of edge pixels from which on the maps must be black on white
 
 
@@ -143,3 +144,24 @@ def read_grey(path):
     if image.dtype != np.uint8:
         return None
     return image if image.ndim == 2 else np.ascontiguousarray(image[:, :, :3].max(axis=2))
+
+
+def read_mask(path, size=None):
+    """(H, W) uint8, 1 where a mask keeps. size: (width, height) px of the view, to which the mask is brought."""
+    import cv2
+
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if is_usable(path) else None
+    if image is None:
+        raise UserError(
+            f"{path}: the mask is missing, truncated or not an image; write it again, or correct source.masks"
+        )
+    grey = image if image.ndim == 2 else image[:, :, : min(image.shape[2], 3)].max(axis=2)
+    full = np.iinfo(grey.dtype).max if grey.dtype.kind == "u" else 1.0
+    kept = (grey >= full * (MASK_KEEPS / 255)).astype(np.uint8)
+    height, width = kept.shape
+    if size is None or (width, height) == tuple(size):
+        return kept
+    if abs(width * size[1] / size[0] - height) > 1 and abs(height * size[0] / size[1] - width) > 1:
+        problem = f"the mask is {width} x {height} px, its image {size[0]} x {size[1]} px"
+        raise UserError(f"{path}: {problem}; write it in that size, or set source.masks: none")
+    return cv2.resize(kept, tuple(size), interpolation=cv2.INTER_NEAREST)

@@ -105,13 +105,8 @@ def check_points(frames, cameras):
     raise UserError(f"{frames.where}: {trouble.format('box of the points') if trouble else f'only {seen}'}: {cure}")
 
 
-def check_box(frames, cameras, box, given=True):
-    """UserError where the scene box is not what the views show. box: (2, 3) corners, input units.
-
-    given: by the scene. What a layout or its points say may be out of sight of some views; they are named.
-    Returns warnings.
-    """
-    box = np.asarray(box, dtype=np.float64)
+def check_box(frames, cameras, box):
+    """UserError where the scene box, (2, 3) corners in input units, is not what the views show."""
     seen = _seen_of_box(cameras, box)
     seeing, most = seen.any(axis=1), int(seen.sum(axis=0).max())
     corners = " to ".join("(" + ", ".join(f"{x:g}" for x in corner) + ")" for corner in box)
@@ -124,13 +119,15 @@ def check_box(frames, cameras, box, given=True):
         overlap = "the views do not overlap: take pictures from between them, or correct the poses or the box"
         raise UserError(f"{frames.where}: {problem}; {_what_helps(cameras, box, seeing.sum()) or overlap}")
     names = [name for name, sees in zip(frames.names, seeing, strict=True) if not sees]
-    if names and given:
+    if names:
         which = f"{len(names)} of {len(seeing)} views ({name_some(names)})"
         cure = _what_helps(cameras, box, len(seeing) - 1) or f"correct the box or the pose, {LEAVE_OUT}"
         raise UserError(f"{frames.where}: {which}: the scene box {corners} is not in sight; {cure}")
-    if not names:
-        return ()
-    return (f"{len(names)} of {len(seeing)} views do not see the scene box {corners}: {name_some(names)}",)
+
+
+def views_in_sight(cameras, box):
+    """(V,) bool: which views have some of the (2, 3) box in front of them and inside the image."""
+    return _seen_of_box(cameras, np.asarray(box, dtype=np.float64)).any(axis=1)
 
 
 def _share_seen(cameras, points):

@@ -75,7 +75,7 @@ def undistorted_frames(frames, folder, max_size, gamma=None, threads=None, progr
         frames,
         intrinsics=[plan.intrinsics_for for plan in plans],
         lenses=[None] * len(plans),
-        size=plans[0].canvas if frames.size else None,
+        size=plans[0].canvas,
         **made,
     )
 
@@ -283,7 +283,9 @@ def _check_fits(path, image, plan):
     size = (image.shape[1], image.shape[0])
     if not _same_aspect(size, plan.picture):
         what = f"{size[0]} x {size[1]} px, but its image is {plan.picture[0]} x {plan.picture[1]} px"
-        raise UserError(f"{path}: this is {what}, of another shape; write it in that size, {LEAVE_OUT}")
+        turned = _same_aspect(size[::-1], plan.picture)
+        why = "turned by the image's EXIF orientation, which cameras do not know" if turned else "of another shape"
+        raise UserError(f"{path}: this is {what}, {why}; write it in that size, {LEAVE_OUT}")
 
 
 def _write(path, image):
