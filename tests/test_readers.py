@@ -153,6 +153,15 @@ def test_opengl_axes_look_along_minus_z(nerf):
     np.testing.assert_allclose(depths, 2.0)
 
 
+def test_a_listing_can_be_named_in_place_of_its_folder(folder):
+    expected = folder.read()
+    other = folder.listing.rename(folder.path / "other.json")
+    config = SourceConfig(reader=folder.kind, path="unused", **({"edges": "edge"} if folder.kind == "emap" else {}))
+    views = views_of_maps(READERS[folder.kind](other, config), config, UNIT_BOX, folder.warnings)
+    assert views.names == expected.names
+    np.testing.assert_array_equal(views.world_to_camera, expected.world_to_camera)
+
+
 def test_opencv_axes_look_along_z(emap):
     """Written out by hand: a camera at z = -2 that looks up at the cube from below, x to the right, y down."""
     lens = [[64.0, 0, 31.5], [0, 64.0, 31.5], [0, 0, 1]]
