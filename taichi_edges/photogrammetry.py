@@ -18,6 +18,7 @@ MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")  # the last tw
 NEEDED_FILES = MODEL_FILES[:3]
 LAST_PAIRED = 80  # images; of more, not every pair is matched
 NEIGHBOURS = 10  # images after each, in the order of their names, with which it is then matched; and 2^i farther ones
+FEATURE_SIZE = 2000  # px of the longest side, to which images are shrunk for it: 24 megapixels take 2 GiB and 30 s each
 RICH = 10  # images of one camera from which on they determine tangential distortion, too
 SMALLEST_MODEL = 3  # images
 PAIRS_AT_ONCE = 40  # matched between two reports
@@ -199,7 +200,7 @@ def _extract(database, images, names, groups, masks, threads, progress):
     for group in groups:
         reader = pycolmap.ImageReaderOptions(camera_model="OPENCV" if len(group) >= RICH else "SIMPLE_RADIAL")
         pycolmap.import_images(str(database), str(images), pycolmap.CameraMode.SINGLE, group, reader)
-    options = pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False)
+    options = pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False, max_image_size=FEATURE_SIZE)
     reader = pycolmap.ImageReaderOptions(mask_path=str(masks)) if masks else pycolmap.ImageReaderOptions()
     single, device = pycolmap.CameraMode.SINGLE, pycolmap.Device.cpu  # images keep the cameras that they have
     with progress.track("find features", len(names)) as report:

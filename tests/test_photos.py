@@ -1,20 +1,25 @@
 """Photographs without poses: structure from motion of a scene whose cameras are known, and what to do without it."""
 
 import json
-import time
+import shutil
+import struct
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 
-from taichi_edges import photogrammetry
+from taichi_edges import photogrammetry, stages
 from taichi_edges.cameras import invert_pose
 from taichi_edges.errors import UserError
 from taichi_edges.photogrammetry import image_pairs
+from taichi_edges.pipeline import Run
 from taichi_edges.progress import Progress
 from taichi_edges.readers import photos
+from taichi_edges.readers.images import read_grey
 from taichi_edges.readers.photos import posed_photos, read_photos
+from taichi_edges.readers.picture_sizes import picture_size
 from taichi_edges.scene_file import check_scene
 from taichi_edges.synthetic.rendering import look_at
 
@@ -87,13 +92,11 @@ def posed(folder, cache, threads=2, **source):
 @pytest.fixture(scope="module")
 def solved(album, tmp_path_factory):
     cache = tmp_path_factory.mktemp("cache")
-    started = time.perf_counter()
-    frames, told = posed(album[0], cache)
-    return frames, told, cache, time.perf_counter() - started
+    return *posed(album[0], cache), cache
 
 
 def test_cameras_are_where_the_photographs_were_taken(album, solved):
-    frames, told, _, _ = solved
+    frames, told, _ = solved
     assert frames.names == sorted(album[1])  # but not the one of something else
     centres = np.stack(frames.camera_to_world)[:, :3, 3]
     truth = np.array([invert_pose(album[1][name])[:, 3] for name in frames.names])
@@ -129,6 +132,32 @@ def test_threads_and_repetition_do_not_change_a_bit(album, solved, tmp_path):
     other, _ = posed(album[0], tmp_path, threads=1)
     assert (np.stack(other.camera_to_world) == np.stack(solved[0].camera_to_world)).all()
     assert (other.points == solved[0].points).all() and other.lenses == solved[0].lenses
+
+
+def test_edges_are_prepared_from_photographs_alone(album, solved, tmp_path):
+    shutil.copytree(solved[2], tmp_path / "run" / "sfm")
+    scene = {"name": "album", "source": {"reader": "images", "path": str(album[0])}}
+    told = Told()
+    run = Run(check_scene(scene, Path("album.yaml")), tmp_path / "run", threads=2, progress=told)
+    facts = stages.prepare(run)
+    assert facts["views"] + len(facts["held_out"]) == VIEWS and facts["box_from"] == "reader" and facts["edgels"] > 1000
+    assert "seeds.ply" in facts["files"] and (run.folder / "undistorted" / "images" / "photo 0.png").is_file()
+    assert any(
+        str(path).endswith("thumb.png") for path in stages.source_files(run)
+    )  # it may register when others change
+
+
+def test_a_note_on_how_the_camera_was_held_turns_no_pixel(tmp_path):
+    """COLMAP and OpenCV must see the same pixels; EXIF's orientation 6 asks viewers for a quarter turn."""
+    picture = cv2.imencode(".jpg", np.zeros((40, 60), np.uint8))[1].tobytes()
+    tag = struct.pack(">HHHIHH", 1, 0x112, 3, 1, 6, 0)  # one entry: orientation, a short, one of them
+    note = b"Exif\0\0MM\0*\0\0\0\x08" + tag + bytes(4)
+    path = tmp_path / "a.jpg"
+    path.write_bytes(picture[:2] + b"\xff\xe1" + struct.pack(">H", len(note) + 2) + note + picture[2:])
+    assert cv2.imread(str(path)).shape[:2] == (60, 40)  # the note is understood, where it is heeded
+    lens = pycolmap.infer_camera_from_image(str(path))
+    assert (lens.width, lens.height) == picture_size(path) == (60, 40)
+    assert cv2.imread(str(path), cv2.IMREAD_UNCHANGED).shape[:2] == read_grey(path).shape == (40, 60)
 
 
 def test_photographs_that_show_nothing_in_common_are_refused_with_advice(tmp_path, generator):

@@ -248,6 +248,8 @@ def _make(jobs, folder, known, gamma, threads, progress):
     keys = [_key(source, kind, plan, gamma) for source, _, kind, plan in jobs]
     labels = [target.relative_to(folder).as_posix() for _, target, _, _ in jobs]
     due = [i for i, (_, target, _, _) in enumerate(jobs) if known.get(labels[i]) != keys[i] or not target.is_file()]
+    if not due:
+        return
     maps, exponent = _Maps(kept=max(threads or os.cpu_count(), 1)), gamma or None
 
     def make(i):
@@ -258,13 +260,12 @@ def _make(jobs, folder, known, gamma, threads, progress):
         return i
 
     try:
-        with progress.track("undistort", max(len(due), 1)) as report, ThreadPoolExecutor(threads) as pool:
+        with progress.track("undistort", len(due)) as report, ThreadPoolExecutor(threads) as pool:
             for done, i in enumerate(pool.map(make, due)):
                 known[labels[i]] = keys[i]
                 report(done + 1)
     finally:
-        if due:
-            write_json(folder / "index.json", known)
+        write_json(folder / "index.json", known)
 
 
 def _key(source, kind, plan, gamma):
