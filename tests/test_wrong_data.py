@@ -100,6 +100,17 @@ def test_the_scene_itself_is_fine(scene, layout):
     assert (status, error) == (0, "") and not [line for line in others if line.startswith("warning")]
 
 
+def test_the_scene_file_of_a_folder_that_was_run_runs_again_from_anywhere(scene, tmp_path, monkeypatch):
+    scene.write_emap()
+    monkeypatch.chdir(tmp_path)
+    assert main(["scene", "--until", "prepare", "--set", "source.detector=subpixel"]) == 0
+    monkeypatch.chdir(tmp_path.parent)
+    scene.capsys.readouterr()
+    again = tmp_path / "runs" / "scene" / "scene.yaml"
+    assert main([str(again), "--out", str(tmp_path / "runs"), "--until", "prepare"]) == 0
+    assert "prepare: up to date" in scene.capsys.readouterr().err
+
+
 # --------------------------------------------------------------------------------------------------------------- poses
 
 
