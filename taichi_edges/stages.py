@@ -55,8 +55,8 @@ def prepare(run):
     box, box_from = _scene_box(run, frames)
     if box_from == "reader":
         frames = frames_in_sight(frames, source, box, run.progress)
-    check_before_detection(frames, source, box)
     _refuse_missing_points(run, frames)
+    check_before_detection(frames, source, box)
     refuse_copies(frames, run.progress)
     detector = choose_detector(source, frames)
     _refuse_needless_calibration(run, detector)

@@ -12,12 +12,13 @@ from taichi_edges.cameras import OPENGL_TO_OPENCV, Similarity, inside_image, inv
 from taichi_edges.errors import UserError, name_some
 
 LEAST_VIEWS = 3  # two viewing planes always meet: only a third tells an edge from chance
-BOX_GRID = 9  # points along each side of the scene box that are looked for in every view
-SAME_PLACE = 1e-6  # of the cameras' distances from the origin or each other: rounding
+BOX_GRIDS = (9, 33)  # points along each side of the scene box that are looked for in every view; if in vain, more
+SAME_PLACE = 1e-7  # of the coordinates: rounding, of files in single precision
 LEAST_SPREAD = 1 / 200  # of the box's longest side, between cameras: a parallax of 0.3 degrees and less places nothing
 SMALLEST_BOX = 8.0  # px across: a box that spans less holds no edges
 MOST_POINTS = 2000  # points that are looked for in the views
-ENOUGH_SEEN = 0.5  # share of the points that LEAST_VIEWS must have in front of them and in their images
+LEAST_SEEN = 0.2  # share of the points that LEAST_VIEWS must have in their images; a scan may be larger
+ENOUGH_SEEN = 0.5  # of the points, where something has been tried: that is it
 UNITS = (1000.0, 0.001)  # millimetres for metres, and the other way round
 LEAVE_OUT = "or leave such views out with source.skip"
 
@@ -89,7 +90,7 @@ def check_points(frames, cameras):
         return
     points = frames.points[:: -(-len(frames.points) // MOST_POINTS)]
     share, trouble = _share_seen(cameras, points)
-    if share >= ENOUGH_SEEN and trouble is None:
+    if share >= LEAST_SEEN and trouble is None:
         return
     used, other = _axes(cameras)
     trials = {
@@ -140,9 +141,13 @@ def _share_seen(cameras, points):
 
 def _seen_of_box(cameras, box):
     """(V, n) bool: which views see which points of a grid through the (2, 3) box."""
-    axes = [np.linspace(low, high, BOX_GRID) for low, high in zip(*box, strict=True)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    return cameras.see(grid, Similarity.of_box(box))
+    for count in BOX_GRIDS:
+        axes = [np.linspace(low, high, count) for low, high in zip(*box, strict=True)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        seen = cameras.see(grid, Similarity.of_box(box))
+        if seen.any(axis=1).all() and seen.sum(axis=0).max() >= LEAST_VIEWS:
+            break
+    return seen
 
 
 def _axes(cameras):
