@@ -38,38 +38,24 @@ def prepare(run):
     if run.config.source.reader == "synthetic":
         return _prepare_synthetic(run)
     from taichi_edges.detectors import DETECTORS, choose_detector
-    from taichi_edges.readers.frames import (
-        build_views,
-        camera_poses,
-        check_before_detection,
-        chosen_frames,
-        frames_in_sight,
-    )
-    from taichi_edges.readers.images import refuse_copies
-    from taichi_edges.readers.undistortion import undistorted_frames
+    from taichi_edges.readers.frames import build_views, camera_poses, chosen_frames
 
     source = run.config.source
     frames = _posed_frames(run, chosen_frames(_listed_frames(run), source.skip))
     _pass_on(frames, run.progress)
     camera_poses(frames)  # a mistake in them shall not wait for the detector
     box, box_from = _scene_box(run, frames)
-    if box_from == "reader":
-        frames = frames_in_sight(frames, source, box, run.progress)
     _refuse_missing_points(run, frames)
-    check_before_detection(frames, source, box)
-    refuse_copies(frames, run.progress)
+    frames = _checked(run, frames, box, guessed=box_from == "reader")
     detector = choose_detector(source, frames)
     _refuse_needless_calibration(run, detector)
-    frames = undistorted_frames(
-        frames, run.path("undistorted"), source.max_size, source.gamma, run.threads, run.progress
-    )
+    frames = _undistorted(run, frames)
     frames, edge_maps, edgels = DETECTORS[detector](frames, run)
     views = _inside_the_run(run, build_views(frames, edge_maps, edgels, source, box, run.progress))
-    facts = _finish_views(run, views, frames)
+    facts = {"detector": detector, "box": np.array(box).tolist(), "box_from": box_from}
+    facts |= _finish_views(run, views, frames)
     own = [path for path in views.image_paths if path and not Path(path).is_absolute()]
-    points = _write_points(run, frames, box)
-    about_box = {"box": np.asarray(box, dtype=float).tolist(), "box_from": box_from}
-    return {"detector": detector, **about_box, **facts, "files": [*own, *facts["files"], *points]}
+    return {**facts, "files": [*own, *facts["files"], *_write_points(run, frames, box)]}
 
 
 def _listed_frames(run):
@@ -113,6 +99,27 @@ def _scene_box(run, frames):
         found = f"{len(frames.points)} points fit well enough to tell where the scene is"
         raise UserError(f"{frames.where}: only {found}; set box, or raise source.max_point_error")
     return UNIT_CUBE, "unit cube"
+
+
+def _checked(run, frames, box, guessed):
+    """The frames, whose cameras and box can be those of one scene; without those that do not see a guessed box."""
+    from taichi_edges.readers.frames import check_before_detection, frames_in_sight
+    from taichi_edges.readers.images import refuse_copies
+
+    source = run.config.source
+    if guessed:
+        frames = frames_in_sight(frames, source, box, run.progress)
+    check_before_detection(frames, source, box)
+    refuse_copies(frames, run.progress)
+    return frames
+
+
+def _undistorted(run, frames):
+    """The frames as pinhole cameras would have taken them, their pictures in the run's folder."""
+    from taichi_edges.readers.undistortion import undistorted_frames
+
+    source, folder = run.config.source, run.path("undistorted")
+    return undistorted_frames(frames, folder, source.max_size, source.gamma, run.threads, run.progress)
 
 
 def _refuse_missing_points(run, frames):

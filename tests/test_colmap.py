@@ -245,6 +245,15 @@ def test_the_box_of_an_object_leaves_out_the_room_around_it(generator):
     assert np.abs(box).max() < 2.0
 
 
+def test_the_box_of_a_facade_holds_it_and_has_some_depth(generator):
+    wall = generator.uniform([-10, -3, 0], [10, 3, 0.1], (2000, 3))
+    poses = np.tile(np.diag([1.0, 1, 1, 1]), (8, 1, 1))
+    poses[:, 0, 3], poses[:, 2, 3] = np.linspace(-8, 8, 8), -7  # in a row, all looking straight at it
+    box = scene_box(wall, poses)
+    assert (box[0] <= [-10, -3, 0]).all() and (box[1] >= [10, 3, 0.1]).all()
+    assert 0.5 < box[1, 2] - box[0, 2] < 4 and np.abs(box[:, 0]).max() < 12
+
+
 def test_the_box_follows_the_points_scale_and_place(generator):
     points, poses = generator.normal(0, 1, (500, 3)), ring(12, 4.0, generator)
     box = scene_box(points, poses)

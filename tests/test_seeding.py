@@ -196,6 +196,7 @@ def test_without_votes_the_training_starts_from_the_given_or_random_points(
     warned = Warned()
     gaussians = stages._start(Run(config, tmp_path, progress=warned), blank, np.random.default_rng(0))
     assert len(warned.lines) == 1 and warned.lines[0].endswith(f"the training starts from {named} instead")
+    assert "poses or intrinsics may not be those of these images" in warned.lines[0]
     assert len(gaussians) == (80 if points else 300)
     if points:
         np.testing.assert_allclose(gaussians.means, given, atol=1e-6)

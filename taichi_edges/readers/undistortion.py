@@ -66,8 +66,9 @@ def undistorted_frames(frames, folder, max_size, gamma=None, threads=None, progr
     max_size: px of the longest side from which on photographs are made smaller, 0: never. gamma: see `as_picture`.
     """
     sizes = _picture_sizes(frames, threads)
-    if not any(frames.lenses) and (len(set(sizes)) > 1 or not 0 < max_size < max(sizes[0])):
-        return frames  # those of one size need nothing, those of several are refused later
+    as_told = len(set(sizes)) == 1 and frames.size in (None, sizes[0])
+    if not any(frames.lenses) and not (as_told and 0 < max_size < max(sizes[0])):
+        return frames  # small ones need nothing, and what is not as the layout says is refused later
     _check_lenses(frames, sizes, progress)
     plans = _plans(frames, sizes, max_size)
     made = _make_all(frames, plans, Path(folder), gamma, threads, progress)
