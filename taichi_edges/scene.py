@@ -218,7 +218,8 @@ class FilterConfig(Section):
         0.54, description="refine: share of the unexplained edgels near a point that lie on it, relative to sure edges"
     )
     min_evidence: NotNegative = Field(
-        0.7, description="refine: that an edge is no passing contour, log likelihood ratio from its views; 0: not tested"
+        0.7,
+        description="refine: that an edge is no passing contour, log likelihood ratio from its views; 0: not tested",
     )
     min_angle: Annotated[float, Field(ge=0, le=90)] = Field(
         15.0, description="refine: an edge that few views see is seen from directions so far from their mean, degrees"
@@ -251,6 +252,7 @@ class RefineConfig(Section):
     """From single edges to a connected wireframe that agrees with the images (beyond the paper)."""
 
     enabled: bool = Field(False, description="false: the edges stay as they were fitted")
+    min_support: Share = Field(0.0, description="share of the views with an edge in their image that must show it")
     min_views: Positive = Field(2.5, description="views that must show an edge, each counted by its strength")
     min_steadiness: Share = Field(
         0.66, description="share of the edgels about an edge that lie on it; contours have half"
@@ -416,16 +418,16 @@ PHOTOGRAPHED = {
     "source": {"min_chain": 12, "tolerance_px": 0.7},
     "train": {"seeds": "sweep", "gaussians": 60_000, "steps": 200, "learning_rates": {"means": 1e-4}},
     "filter": {
+        "min_support": 0.15,
         "min_views": 2.2,
         "min_steadiness": 0.0,
         "min_evidence": 0.0,
         "min_angle": 0.0,
         "harvest": False,
         "grow": 0.0,
-        "grow_step": 3.0,
     },
     "cluster": {"min_points": 5, "max_gap": 0.015},
-    "refine": {"min_views": 2.0, "min_steadiness": 0.3},
+    "refine": {"min_support": 0.15, "min_views": 2.0, "min_steadiness": 0.3},
 }
 SCALES = {
     "object": {"paper": {}, "fast": {}},

@@ -26,6 +26,7 @@ from taichi_edges.wireframe import read_wireframe, write_wireframe
 
 WIDEST_PX = 40.0  # of a detector's lines
 UNIT_CUBE = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+WRONG_CAMERAS = "poses or intrinsics may not be those of these images (their order, axes or scale)"
 CALIBRATION_SEEDS = 4000  # 3D points through which a detector's biases are measured, at most
 
 
@@ -45,9 +46,10 @@ def prepare(run):
     camera_poses(frames)  # a mistake in them shall not wait for the detector
     box, box_from = _scene_box(run, frames)
     _refuse_missing_points(run, frames)
+    frames = _checked(run, frames, box, guessed=box_from == "reader")
     detector = choose_detector(source, frames)
     _refuse_needless_calibration(run, detector)
-    frames = _undistorted(run, frames, box if box_from == "reader" else None)
+    frames = _undistorted(run, frames)
     frames, edge_maps, edgels = DETECTORS[detector](frames, run)
     views = _inside_the_run(run, build_views(frames, edge_maps, edgels, source, box, run.progress))
     facts = {"detector": detector, "box": np.array(box).tolist(), "box_from": box_from}
@@ -99,14 +101,25 @@ def _scene_box(run, frames):
     return UNIT_CUBE, "unit cube"
 
 
-def _undistorted(run, frames, guessed_box):
-    """The frames as pinhole cameras would have taken them; without those that do not see a box nobody has set."""
-    from taichi_edges.readers.frames import frames_in_sight
+def _checked(run, frames, box, guessed):
+    """The frames, whose cameras and box can be those of one scene; without those that do not see a guessed box."""
+    from taichi_edges.readers.frames import check_before_detection, frames_in_sight
+    from taichi_edges.readers.images import refuse_copies
+
+    source = run.config.source
+    if guessed:
+        frames = frames_in_sight(frames, source, box, run.progress)
+    check_before_detection(frames, source, box)
+    refuse_copies(frames, run.progress)
+    return frames
+
+
+def _undistorted(run, frames):
+    """The frames as pinhole cameras would have taken them, their pictures in the run's folder."""
     from taichi_edges.readers.undistortion import undistorted_frames
 
     source, folder = run.config.source, run.path("undistorted")
-    frames = undistorted_frames(frames, folder, source.max_size, source.gamma, run.threads, run.progress)
-    return frames if guessed_box is None else frames_in_sight(frames, guessed_box, source.axes, run.progress)
+    return undistorted_frames(frames, folder, source.max_size, source.gamma, run.threads, run.progress)
 
 
 def _refuse_missing_points(run, frames):
@@ -396,7 +409,7 @@ def _start(run, views, generator):
         seeds = "points" if run.path("seeds.ply").is_file() else "random"
         instead = {"points": "the given points", "random": "random points"}[seeds]
         found = f"the views agree on an edge in fewer than {LEAST_VOTED} places"
-        run.progress.warn(f"{found}; the training starts from {instead} instead")
+        run.progress.warn(f"{found}: {WRONG_CAMERAS}; the training starts from {instead} instead")
     if seeds == "random" or not run.path("seeds.ply").is_file():
         points = random_points(config.gaussians, views.box, generator)
     else:

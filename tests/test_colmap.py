@@ -181,10 +181,12 @@ def test_a_damaged_model_is_refused_in_one_line(project, damaged, text):
 
 
 def test_a_model_without_points_needs_a_box_from_the_scene(tmp_path, poses):
-    write_model(tmp_path / "sparse", ["a.png"] * 1, [camera("PINHOLE")], poses[:1], np.zeros((0, 3)))
+    names = ["a.png", "b.png", "c.png"]
+    write_model(tmp_path / "sparse", names, [camera("PINHOLE")] * 3, poses[:3], np.zeros((0, 3)))
     (tmp_path / "images").mkdir()
-    picture = cv2.rectangle(np.zeros(SIZE[::-1], np.uint8), (100, 70), (220, 170), 200, -1)
-    cv2.imwrite(str(tmp_path / "images" / "a.png"), picture)
+    for view, name in enumerate(names):
+        picture = cv2.rectangle(np.zeros(SIZE[::-1], np.uint8), (100 + view, 70), (220, 170), 200, -1)
+        cv2.imwrite(str(tmp_path / "images" / name), picture)
     (tmp_path / "run").mkdir()
     with pytest.raises(UserError, match="images.bin: only 0 points fit well enough .*; set box"):
         stages.prepare(Run(scene(tmp_path), tmp_path / "run"))
@@ -279,8 +281,8 @@ def test_views_that_look_away_from_a_box_nobody_has_set_are_left_out(tmp_path, g
     model.frame(6).rig_from_world = pycolmap.Rigid3d(poses[5])
     model.write(str(tmp_path / "sparse"))
     (tmp_path / "images").mkdir()
-    for name in names:
-        picture = cv2.rectangle(np.zeros(SIZE[::-1], np.uint8), (100, 70), (220, 170), 200, -1)
+    for view, name in enumerate(names):
+        picture = cv2.rectangle(np.zeros(SIZE[::-1], np.uint8), (100 + view, 70), (220, 170), 200, -1)
         cv2.imwrite(str(tmp_path / "images" / name), picture)
     (tmp_path / "run").mkdir()
     told = Told()

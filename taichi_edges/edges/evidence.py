@@ -225,6 +225,13 @@ def steadiness(matching, support):
     return samples.sums(on.sum(axis=1)) / np.maximum(samples.sums(mine.sum(axis=1)), 1)
 
 
+def support_share(matching, support):
+    """(E,) number of views that support each edge, each counted by its weight, of those that have it in their image."""
+    samples, views = support.samples, slice(0, matching.edgels.view_count)
+    inside = matching.matches(samples.points, samples.directions, views, MATCH_PX)[2].sum(axis=1)
+    return samples.sums(support.views) / np.maximum(samples.sums(inside), 1)
+
+
 def claims_of(matching, shapes):
     """The Claims of shapes, for `support_along`. matching: EdgelMatching."""
     return support_of(matching, shapes).claims

@@ -111,7 +111,9 @@ def judge(matching, refined, config):
     from taichi_edges.explaining import explain
 
     explained = explain(matching, refined)
-    apart = (refined.views >= FEW_VIEWS * config.min_views) | (refined.spread >= np.sin(np.radians(config.min_angle)) ** 2)
+    apart = (refined.views >= FEW_VIEWS * config.min_views) | (
+        refined.spread >= np.sin(np.radians(config.min_angle)) ** 2
+    )
     supported = (explained.support >= config.min_support) & (refined.views >= config.min_views) & apart
     steady, places = supported.copy(), refined.points[supported]
     if len(places):

@@ -8,7 +8,7 @@ import numpy as np
 from taichi_edges.edges.adjustment import adjusted
 from taichi_edges.edges.completion import completed
 from taichi_edges.edges.continuation import Merging, continued
-from taichi_edges.edges.evidence import claims_of, evidence_of, steadiness, support_along, support_of
+from taichi_edges.edges.evidence import claims_of, evidence_of, steadiness, support_along, support_of, support_share
 from taichi_edges.edges.extents import extended
 from taichi_edges.edges.junctions import connected
 from taichi_edges.edges.model_selection import Yardstick
@@ -51,16 +51,16 @@ def refine_wireframe(loose, views, config):
         return loose, RefineCounts()
     matching = EdgelMatching(views, config.min_views)
     strokes = [shape for shape in loose.shapes if shape.length >= LEAST_LENGTH_PX * matching.pixel]
-    shapes, merging, unsupported = whole_edges(strokes, matching, config.min_steadiness)
+    shapes, merging, unsupported = whole_edges(strokes, matching, config)
     wireframe, lines = completed(connected(shapes, matching.pixel), matching)
     wireframe, relations = related(adjusted(wireframe, matching), matching, config.regularise)
-    judged = with_evidence(wireframe, matching, config.min_steadiness)
+    judged = with_evidence(wireframe, matching, config)
     unsupported += len(wireframe) - len(judged)
     counts = RefineCounts(**asdict(merging), lines=lines, unsupported=unsupported, relations=relations)
     return judged, counts
 
 
-def whole_edges(shapes, matching, steady):
+def whole_edges(shapes, matching, config):
     """The shapes of whole edges from those of strokes, Merging, and how many were left out for lack of support.
 
     Free ends are extended only when it is known which are free, and then some more strokes continue each other.
@@ -68,9 +68,9 @@ def whole_edges(shapes, matching, steady):
     pixel, seen = matching.pixel, partial(support_along, matching)
     yardstick = yardstick_of(shapes, matching)
     shapes, first = continued(shapes, yardstick, pixel, seen)
-    kept = with_support(matching, shapes, steady)
+    kept = with_support(matching, shapes, config)
     longer, second = continued(with_longer_ends(matching, kept), yardstick, pixel, seen, WIDE_GAP_PX)
-    found = with_support(matching, longer, steady)
+    found = with_support(matching, longer, config)
     merging = Merging(*(sum(pair) for pair in zip(astuple(first), astuple(second), strict=True)))
     return found, merging, len(shapes) - len(kept) + len(longer) - len(found)
 
@@ -90,25 +90,30 @@ def related(wireframe, matching, impose):
     return wireframe, {kind: (count, 0) for kind, count in found_relations(wireframe, matching)[0].items()}
 
 
-def with_evidence(wireframe, matching, steady):
+def with_evidence(wireframe, matching, config):
     """The Wireframe with what the images say about each edge, and without those they do not support."""
     support = support_of(matching, wireframe.shapes)
     found = evidence_of(support)
     edges = tuple(replace(edge, evidence=of) for edge, of in zip(wireframe.edges, found, strict=True))
     sure = np.array([of.confidence >= LEAST_CONFIDENCE for of in found], dtype=bool)
-    return replace(wireframe, edges=edges).keep(sure & is_edge(matching, support, wireframe.shapes, steady))
+    return replace(wireframe, edges=edges).keep(sure & is_edge(matching, support, wireframe.shapes, config))
 
 
-def with_support(matching, shapes, steady):
+def with_support(matching, shapes, config):
     """The shapes that the images support; their places are not exact yet."""
-    kept = is_edge(matching, support_of(matching, shapes), shapes, LENIENT * steady)
+    kept = is_edge(matching, support_of(matching, shapes), shapes, config, LENIENT)
     return [shape for shape, keep in zip(shapes, kept, strict=True) if keep]
 
 
-def is_edge(matching, support, shapes, steady):
-    """(E,) bool: enough of a shape is supported, and its edgels stay on it as the viewpoint moves."""
+def is_edge(matching, support, shapes, config, lenience=1.0):
+    """(E,) bool: enough of a shape is supported, by enough views, and its edgels stay on it as the viewpoint moves.
+
+    config: the scene's `refine` section. lenience: factor on what it asks for.
+    """
     enough = support.supported_lengths >= LEAST_SUPPORTED * np.array([shape.length for shape in shapes])
-    return enough & (steadiness(matching, support) >= steady)
+    if config.min_support:
+        enough &= support_share(matching, support) >= lenience * config.min_support
+    return enough & (steadiness(matching, support) >= lenience * config.min_steadiness)
 
 
 def with_longer_ends(matching, shapes):
