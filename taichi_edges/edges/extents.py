@@ -36,7 +36,8 @@ def all_extended(shapes, sides, seen, pixel):
             except StopIteration as done:
                 found[number] = done.value
                 del steps[number]
-        answers = dict(zip(questions, seen(list(questions), list(questions.values())), strict=True)) if questions else {}
+        asked = seen(list(questions), list(questions.values())) if questions else []
+        answers = dict(zip(questions, asked, strict=True))
     return found
 
 

@@ -69,7 +69,7 @@ class EdgelMatching:
     def densities(self):
         """[(sum of strengths, px^2)] of the edgels of each view that has any, and of the box around them."""
         views = [self.edgels.of_view(view) for view in range(self.edgels.view_count)]
-        return [(strengths.sum(), np.prod(np.ptp(points, axis=0) + 1.0)) for points, _, strengths in views if len(points)]
+        return [(some.sum(), np.prod(np.ptp(points, axis=0) + 1.0)) for points, _, some in views if len(points)]
 
     def equations(self, points, directions, radius, scale):
         """(n, EQUATIONS) float32 normal equations of where the points are, see `add_equations`.
