@@ -68,11 +68,11 @@ class ArcBatch:
     @cached_property
     def frame(self):
         """(m, 3, 3) rows: tangent, inward normal (any, of a line) and the normal of the plane, at the origin."""
-        aside = np.cross(self.tangent, np.eye(3)[np.argmin(np.abs(self.tangent), axis=1)])
-        aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+        aside = crosses(self.tangent, np.eye(3)[np.argmin(np.abs(self.tangent), axis=1)])
+        aside /= np.sqrt((aside**2).sum(axis=1, keepdims=True))
         bent = self.curvature[:, None]
         inward = np.where(bent > FLAT, self.bend / np.maximum(bent, FLAT), aside)
-        return np.stack([self.tangent, inward, np.cross(self.tangent, inward)], axis=1)
+        return np.stack([self.tangent, inward, crosses(self.tangent, inward)], axis=1)
 
     def coordinates(self, points, of):
         """(t,) arc lengths of the nearest places, and (t, 2) offsets from these, see `Arc.coordinates`."""
@@ -102,7 +102,7 @@ class ArcBatch:
         """The same with their origins in their middles."""
         each, middle, half = np.arange(len(self)), 0.5 * (self.low + self.high), 0.5 * self.length
         tangent = self.tangents(middle, each)
-        bend = self.curvature[:, None] * np.cross(self.frame[:, 2], tangent)
+        bend = self.curvature[:, None] * crosses(self.frame[:, 2], tangent)
         return ArcBatch(self.at(middle, each), tangent, bend, -half, half, self.closed)
 
     def over(self, low, high):
@@ -118,6 +118,12 @@ class ArcBatch:
 
 
 VECTORS, ENDS = ("origin", "tangent", "bend"), ("low", "high", "closed")
+
+
+def crosses(a, b):
+    """Cross products of (m, 3) vectors; np.cross takes several times as long for a few hundred."""
+    ahead, behind = [1, 2, 0], [2, 0, 1]
+    return a[:, ahead] * b[:, behind] - a[:, behind] * b[:, ahead]
 
 
 def sine(along, bent):

@@ -64,7 +64,7 @@ class Cloud:
     def near(self, arc, low, high, tolerance=INLIER):
         """Indices of the points about the arc between two arc lengths; some farther ones are among them."""
         high = min(high, low + arc.round)
-        count = int((high - low) / self.scale.gap) + 1
+        count = int((high - low) / (BALL * self.scale.noise)) + 1
         step = (high - low) / count
         radius = np.hypot(0.5 * step, tolerance * self.scale.noise) * (1 + 1e-9)
         found = self.tree.query_ball_point(arc.at(low + step * (np.arange(count) + 0.5)), radius)

@@ -21,7 +21,7 @@ LEAST_DENSITY = 4.0  # own points on the length of a gap, on average; strays lin
 COVERED = 1.0  # times the tolerance: a point so near to what has grown needs no growth of its own in this round
 ROUNDS, COARSER = 3, 2.0  # of claiming, and from the noise of one to that of the next
 MOST_NOISE = 2e-3  # unit-cube units; coarser rounds would claim neighbouring edges (the paper's lines take 5e-3)
-AT_ONCE = 256  # seeds from which arcs are grown together
+AT_ONCE = 512  # seeds from which arcs are grown together
 TAIL = 0.7  # of the gap: an edge goes on past its sharp points in steps of that size at most
 
 
