@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from taichi_edges.edges.arcs import Arc, fit_arc
+from taichi_edges.edges.arc_batch import ArcBatch, fit_batch
 
 INLIER = 3.0  # noises: a point on an edge lies no farther from it (99 % of those of a normal distribution in a plane)
 SAGITTA = 3.0  # noises that the middle of an arc is off its chord, at least; a line follows a flatter one as well
 START_POINTS = 5  # aligned neighbours that a seed starts with, at least, itself included
 GROWTH = 0.5  # of an arc's length: how far beyond its ends it is looked for; a longer arc foretells more
 GROWTH_ROUNDS = 30
+BALL = 8.0 * INLIER  # noises: length of an arc about which points are looked for at once
 GROWN = 1.02  # an arc that grew by less is done
 DIRECTION_NOISES = 4.0
 TURNS = np.radians([10.0, 35.0])  # a point whose direction is off by more is on another edge, whatever the noise
@@ -63,7 +64,7 @@ class Cloud:
     def near(self, arc, low, high, tolerance=INLIER):
         """Indices of the points about the arc between two arc lengths; some farther ones are among them."""
         high = min(high, low + arc.round)
-        count = int((high - low) / self.scale.gap) + 1
+        count = int((high - low) / (BALL * self.scale.noise)) + 1
         step = (high - low) / count
         radius = np.hypot(0.5 * step, tolerance * self.scale.noise) * (1 + 1e-9)
         found = self.tree.query_ball_point(arc.at(low + step * (np.arange(count) + 0.5)), radius)
@@ -81,27 +82,74 @@ class Cloud:
         good = (squared <= tolerance**2) & agree & (along >= low) & (along <= high)
         return around[good], along[good], squared[good]
 
+    def inliers_of(self, arcs, low, high):
+        """The same for an ArcBatch: numbers of the arcs, indices of their points, ascending, and arc lengths, (t,)."""
+        of, around = self._near_each(arcs, low, high)
+        stretched = ArcBatch(arcs.origin, arcs.tangent, arcs.bend, low, high, arcs.closed)
+        along, offsets = stretched.coordinates(self.points[around], of)
+        good = ((offsets**2).sum(axis=1) / self.scale.noise**2 <= INLIER**2) & (along >= low[of]) & (along <= high[of])
+        of, around, along = of[good], around[good], along[good]
+        agree = np.abs((self.directions[around] * arcs.tangents(along, of)).sum(axis=1)) >= self.scale.cosine
+        return of[agree], around[agree], along[agree]
 
-def grow_arc(cloud, start, straight):
-    """The longest unbroken line or arc that `start`, an Arc with points along it, is a part of, or None."""
-    scale, arc, best = cloud.scale, start, None
-    for _ in range(GROWTH_ROUNDS):
-        ahead = max(GROWTH * arc.length, INLIER * scale.noise)
-        members, along, squared = cloud.inliers(arc, arc.low - ahead, arc.high + ahead)
-        inside = unbroken(along, arc.low, arc.high, min(ahead, scale.gap))
-        members, along, squared = members[inside], along[inside], squared[inside]
-        if len(members) < START_POINTS:
-            return best
-        before = arc.length
-        arc = arc.over(along.min(), along.max())
-        if arc.length + scale.gap >= arc.round:
-            arc = arc.over(arc.low, arc.low + arc.round)
-        places, directions = cloud.points[members], cloud.directions[members]
-        arc = fit_arc(arc.recentred(), places, directions, 0.0, INLIER * scale.noise, straight, 1)
-        if best is not None and arc.length <= GROWN * before:
-            return arc
-        best = arc
-    return best
+    def _near_each(self, arcs, low, high):
+        """Numbers of the arcs, and indices of the points about them, (t,); some farther ones are among them."""
+        high = np.minimum(high, low + arcs.round)
+        counts = ((high - low) / (BALL * self.scale.noise)).astype(int) + 1
+        of = np.repeat(np.arange(len(arcs)), counts)
+        place = np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts, counts)
+        step = (high - low) / counts
+        centres = cKDTree(arcs.at((low + 0.5 * step)[of] + step[of] * place, of))
+        reach = np.hypot(0.5 * step.max(initial=0.0), INLIER * self.scale.noise) * (1 + 1e-9)
+        pairs = centres.sparse_distance_matrix(self.tree, reach, output_type="ndarray")
+        keys = np.unique(of[pairs["i"]] * len(self.points) + pairs["j"])
+        return keys // len(self.points), keys % len(self.points)
+
+
+def grow_arcs(cloud, arcs, straight):
+    """The longest unbroken lines or arcs that those of an ArcBatch are parts of; (m,) bool, whether there are any."""
+    scale, best, found, active = cloud.scale, arcs, np.zeros(len(arcs), bool), np.arange(len(arcs))
+    for _ in range(GROWTH_ROUNDS if len(arcs) else 0):
+        ahead = np.maximum(GROWTH * arcs.length, INLIER * scale.noise)
+        of, members, along = cloud.inliers_of(arcs, arcs.low - ahead, arcs.high + ahead)
+        inside = all_unbroken(of, along, arcs.low, arcs.high, np.minimum(ahead, scale.gap))
+        enough = np.bincount(of[inside], minlength=len(arcs)) >= START_POINTS
+        inside &= enough[of]
+        of, members, along = (np.cumsum(enough) - 1)[of[inside]], members[inside], along[inside]
+        arcs, active = arcs.keep(enough), active[enough]
+        if not len(arcs):
+            break
+        before, starts = arcs.length, np.searchsorted(of, np.arange(len(arcs)))
+        arcs = arcs.over(np.minimum.reduceat(along, starts), np.maximum.reduceat(along, starts))
+        arcs = arcs.over(arcs.low, np.where(arcs.length + scale.gap >= arcs.round, arcs.low + arcs.round, arcs.high))
+        places, directions, none = cloud.points[members], cloud.directions[members], np.zeros(len(arcs))
+        arcs = fit_batch(arcs.recentred(), places, directions, of, none, INLIER * scale.noise, straight, 1)
+        best = best.put(active, arcs)
+        on = ~found[active] | (arcs.length > GROWN * before)
+        found[active] = True
+        arcs, active = arcs.keep(on), active[on]
+    return best, found
+
+
+def all_unbroken(of, along, low, high, gap):
+    """(t,) bool: the points reached from their arc's stretch low..high without a step longer than its gap, (m,) each.
+
+    of, along: (t,) number of the arc, and arc length on it.
+    """
+    order = np.lexsort((along, of))
+    of, along = of[order], along[order]
+    steps = (np.diff(along) > gap[of[1:]]) | (np.diff(of) > 0)
+    run = np.concatenate([[0], np.cumsum(steps)])[: len(along)]
+    counts = np.bincount(run, weights=(along >= low[of]) & (along <= high[of]))
+    owner = of[np.flatnonzero(np.diff(run, prepend=-1))]  # of each run
+    most = np.zeros(len(low))
+    np.maximum.at(most, owner, counts)
+    fullest = np.flatnonzero((counts > 0) & (counts == most[owner]))
+    chosen = np.full(len(low), -1)
+    chosen[owner[fullest[::-1]]] = fullest[::-1]  # of ties the first
+    inside = np.empty(len(along), bool)
+    inside[order] = run == chosen[of]
+    return inside
 
 
 def unbroken(along, low, high, gap):
@@ -117,32 +165,52 @@ def unbroken(along, low, high, gap):
     return inside
 
 
-def grown_from_neighbors(cloud, neighbors, seed, straight):
-    """A line or an arc grown from one point and its aligned neighbours, or None."""
-    near = neighbors[seed]
-    if len(near) < START_POINTS - 1:
-        return None
-    near = np.append(near, seed)
-    start = Arc(cloud.points[seed], cloud.directions[seed], np.zeros(3))
-    along, _ = start.coordinates(cloud.points[near])
-    return refitted(cloud, start.over(along.min(), along.max()), near, straight)
+def grown_from_seeds(cloud, neighbors, seeds):
+    """For each of (m,) seeds the line and the arc grown from it, a list of pairs; None where there is none.
+
+    neighbors: for every point its aligned neighbours, an index array. Where there is a line the arc starts from what
+    that goes along, which on an arc is a chord.
+    """
+    lines, arcs = [None] * len(seeds), [None] * len(seeds)
+    rich = np.flatnonzero([len(neighbors[seed]) >= START_POINTS - 1 for seed in seeds])
+    starts, of, members = from_neighbors(cloud, neighbors, seeds[rich])
+    grown, found = refitted(cloud, starts, of, members, straight=True)
+    on = cloud.inliers_of(grown.keep(found), grown.low[found], grown.high[found])[:2]
+    bent = refitted(cloud, grown.keep(found), *on, straight=False)
+    without = ~found[of]
+    of, members = (np.cumsum(~found) - 1)[of[without]], members[without]
+    rest = refitted(cloud, starts.keep(~found), of, members, straight=False)
+    for number, line in zip(rich[found], grown.keep(found), strict=True):
+        lines[number] = line
+    for numbers, (some, good) in ((rich[found], bent), (rich[~found], rest)):
+        for number, arc in zip(numbers[good], some.keep(good), strict=True):
+            arcs[number] = arc
+    return list(zip(lines, arcs, strict=True))
 
 
-def bent_from(cloud, line):
-    """An arc grown from what a line goes along, or None. On an arc, that is a chord."""
-    members, _, _ = cloud.inliers(line, line.low, line.high)
-    return refitted(cloud, line, members, straight=False)
+def from_neighbors(cloud, neighbors, seeds):
+    """An ArcBatch of lines through seeds, (m,); and their aligned neighbours and themselves: numbers, indices (t,)."""
+    near = [np.append(neighbors[seed], seed) for seed in seeds]
+    of = np.repeat(np.arange(len(seeds)), [len(some) for some in near])
+    members, none = np.concatenate([np.zeros(0, int), *near]), np.zeros(len(seeds))
+    starts = ArcBatch(cloud.points[seeds], cloud.directions[seeds], np.zeros((len(seeds), 3)), none, none, none > 0)
+    along, first = starts.coordinates(cloud.points[members], of)[0], np.searchsorted(of, np.arange(len(seeds)))
+    if len(seeds):
+        starts = starts.over(np.minimum.reduceat(along, first), np.maximum.reduceat(along, first))
+    return starts, of, members
 
 
-def refitted(cloud, start, members, straight):
-    """A line or an arc fitted to some points and grown from there, or None where that bends too little for an arc."""
+def refitted(cloud, starts, of, members, straight):
+    """An ArcBatch fitted to some points of each and grown from there; (m,) bool, whether there is a line, or an arc.
+
+    of, members: (t,) number of the arc, and index of the point. What bends too little is no arc.
+    """
     scale = cloud.scale
     places, directions = cloud.points[members], cloud.directions[members]
-    lever = scale.lever if straight or start.length < scale.gap else 0.0  # on longer stretches the places tell more
-    start = fit_arc(start, places, directions, lever, INLIER * scale.noise, straight)
-    arc = grow_arc(cloud, start, straight)
-    bends = arc is not None and sagitta(arc) >= SAGITTA * scale.noise
-    return arc if straight or bends else None
+    lever = np.where(straight | (starts.length < scale.gap), scale.lever, 0.0)  # on longer stretches places tell more
+    starts = fit_batch(starts, places, directions, of, lever, INLIER * scale.noise, straight)
+    arcs, found = grow_arcs(cloud, starts, straight)
+    return arcs, found & (straight | (arcs.sagitta >= SAGITTA * scale.noise))
 
 
 def sagitta(arc):

@@ -128,7 +128,9 @@ def fit_assembly(points, labels, shared, arcs, config):
 
 def sharers(shared, count):
     """The points of each of `count` edges that they share with others: a list of index arrays."""
-    return [shared[shared[:, 1] == number, 0] for number in range(count)]
+    order = np.argsort(shared[:, 1], kind="stable")
+    bounds = np.searchsorted(shared[order, 1], np.arange(count + 1))
+    return [shared[order[start:end], 0] for start, end in zip(bounds[:-1], bounds[1:], strict=True)]
 
 
 def fit_edge(points, arc, config):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from taichi_edges.edges.arc_growth import INLIER, bent_from, grown_from_neighbors, unbroken
+from taichi_edges.edges.arc_growth import INLIER, grown_from_seeds, unbroken
 from taichi_edges.edges.arcs import Arc, fit_arc
 
 OUTLIER = INLIER**2  # squared noises: what a point on an edge brings at most
@@ -21,6 +21,7 @@ LEAST_DENSITY = 4.0  # own points on the length of a gap, on average; strays lin
 COVERED = 1.0  # times the tolerance: a point so near to what has grown needs no growth of its own in this round
 ROUNDS, COARSER = 3, 2.0  # of claiming, and from the noise of one to that of the next
 MOST_NOISE = 2e-3  # unit-cube units; coarser rounds would claim neighbouring edges (the paper's lines take 5e-3)
+AT_ONCE = 512  # seeds from which arcs are grown together
 TAIL = 0.7  # of the gap: an edge goes on past its sharp points in steps of that size at most
 
 
@@ -120,19 +121,32 @@ def refined(cloud, claim, ledger):
 def candidates(cloud, neighbors, seeds, min_points, owner):
     """Arcs grown from seeds until every point that nobody owns is near one, or has grown none."""
     covered = owner >= 0
-    for seed in seeds:
-        if covered[seed]:
-            continue
+    for seed, pair in grown_pairs(cloud, neighbors, seeds, covered):
         covered[seed] = True
-        line = grown_from_neighbors(cloud, neighbors, seed, straight=True)
-        arc = grown_from_neighbors(cloud, neighbors, seed, straight=False) if line is None else bent_from(cloud, line)
-        grown = [arc for arc in (line, arc) if arc is not None]
+        grown = [arc for arc in pair if arc is not None]
         gains = [supported(cloud, arc, owner, min_points)[0] for arc in grown]
         for arc, gain in zip(grown, gains, strict=True):
             if gain == max(gains):  # even where it is too short to be claimed: its points will not do better
                 covered[cloud.inliers(arc, arc.low, arc.high, COVERED * INLIER)[0]] = True
             if gain > 0:
                 yield arc
+
+
+def grown_pairs(cloud, neighbors, seeds, covered):
+    """(seed, its line and arc) of one seed after the other that is not covered when its turn comes.
+
+    covered: (n,) bool, which changes meanwhile. Arcs are grown AT_ONCE; those of seeds that are covered by then are
+    dropped.
+    """
+    first = 0
+    while first < len(seeds):
+        waiting = seeds[first:]
+        waiting = np.flatnonzero(~covered[waiting])[:AT_ONCE]
+        some = seeds[first + waiting]
+        for seed, pair in zip(some.tolist(), grown_from_seeds(cloud, neighbors, some), strict=True):
+            if not covered[seed]:
+                yield seed, pair
+        first += int(waiting[-1]) + 1 if len(waiting) else len(seeds)
 
 
 def supported(cloud, arc, owner, min_points):

@@ -6,6 +6,7 @@ over all ways to cut it. A stroke that lies beside others on its whole length re
 """
 
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -34,6 +35,7 @@ LEAST_LOOP = 4.0  # times that gap: length of a stroke whose end may continue it
 LONGEST_RUN = 8  # strokes that may become one at once
 FOLLOWED = 0.5  # of the places of a stroke that the shape which replaces it runs along, at least
 CHORDS = 512  # of a shape, for its tangents
+AROUND, MOST_BALLS = 8.0, 4096  # widths of the band about a circle: length searched at once; into so many at most
 COVERED = 0.5  # of a circle by strokes, at least
 GAP_SHOWN = 0.7  # of what lies between them, which the images must show as well
 GAP_SEEN = 0.25  # a place is shown by this share of the views that see the strokes
@@ -70,18 +72,19 @@ def continued(shapes, yardstick, pixel, seen, gap_px=JOINT_GAP_PX):
 def with_whole_circles(shapes, yardstick, pixel, seen):
     """The shapes, arcs replaced by the circle they are parts of where that goes on; and how many circles that gave."""
     shapes, circles = list(shapes), []
-    tracks, bounds = [track_of(shape, pixel) for shape in shapes], bounds_of(shapes)
     waiting = sorted((n for n, shape in enumerate(shapes) if shape.kind == "arc"), key=lambda n: -shapes[n].length)
-    gone = set()
+    if not waiting:
+        return shapes, 0
+    tracks = [track_of(shape, pixel) for shape in shapes]
+    places, gone, alive = Places(tracks), set(), np.array([not shape.closed for shape in shapes])
     for number in waiting:
         if number in gone:
             continue
-        others = [n for n in range(len(shapes)) if n not in gone and not shapes[n].closed]
-        circle = circle_around(shapes[number], [tracks[n] for n in others], yardstick)
+        alive[list(gone)] = False
+        circle = circle_around(shapes[number], places, alive, yardstick)
         if circle is None:
             continue
-        near = near_bounds(bounds, bounds_of([circle])[0], BESIDE * yardstick.noise)
-        others = sorted(set(others) & set(near.tolist()))
+        others = np.unique(places.owners[places.about(circle, BESIDE * yardstick.noise, alive)]).tolist()
         on = {n: on_shape(circle, tracks[n], yardstick) for n in others}
         parts = [n for n in others if on[n].mean() >= REPEATED]
         if number not in parts or not is_cheaper(circle, parts, shapes, tracks, yardstick):
@@ -92,20 +95,47 @@ def with_whole_circles(shapes, yardstick, pixel, seen):
     return [shape for n, shape in enumerate(shapes) if n not in gone] + circles, len(circles)
 
 
-def circle_around(shape, tracks, yardstick):
-    """The whole circle of an arc, fitted to all the places that lie on it; None where it runs away from the arc."""
+class Places:
+    """The places of Tracks in a search tree, so that those about a circle are found without looking at all of them.
+
+    points: (p, 3). owners: (p,) number of the Track. shares: (p,) length that each stands for. longest: (T,) the
+    longest of these of each Track.
+    """
+
+    def __init__(self, tracks):
+        self.points = np.concatenate([track.points for track in tracks])
+        self.shares = np.concatenate([track.share for track in tracks])
+        self.owners = np.repeat(np.arange(len(tracks)), [len(track.points) for track in tracks])
+        self.longest = np.array([track.share.max() for track in tracks])
+        self.tree, self.box = cKDTree(self.points), (self.points.min(axis=0), self.points.max(axis=0))
+
+    def about(self, circle, margin, alive):
+        """Indices, ascending, of the places within `margin` of a circle, of the Tracks that are `alive`, (T,) bool."""
+        step = max(AROUND * margin, circle.length / MOST_BALLS)
+        reach = margin + 0.5 * step
+        centres = circle.at(np.linspace(0.0, 1.0, int(np.ceil(circle.length / step)) + 1))
+        inside = ((centres >= self.box[0] - reach) & (centres <= self.box[1] + reach)).all(axis=1)
+        found = self.tree.query_ball_point(centres[inside], reach)
+        around = np.unique(np.fromiter(chain.from_iterable(found), np.int64))
+        around = around[alive[self.owners[around]]]
+        return around[distances_to(circle, self.points[around]) <= margin]
+
+
+def circle_around(shape, places, alive, yardstick):
+    """The whole circle of an arc, fitted to all the places that lie on it; None where it runs away from the arc.
+
+    places: Places of all Tracks, of which those that are `alive`, (T,) bool, count.
+    """
     middle = shape.low + 0.5 * (shape.high - shape.low)
-    points = np.concatenate([track.points for track in tracks])
-    share = np.concatenate([track.share for track in tracks])
-    circle = shape.over(middle - np.pi, middle + np.pi)
+    circle, longest = shape.over(middle - np.pi, middle + np.pi), places.longest[alive].max()
     for width in (3.0, 2.0, 1.0, 1.0):
-        near = distances_to(circle, points) <= width * BESIDE * yardstick.noise
-        if near.sum() < 6:
+        tolerance = width * BESIDE * yardstick.noise
+        near = places.about(circle, tolerance, alive)
+        if len(near) < 6:
             return None
         arc = through_three(*circle.at(np.array([0.25, 0.5, 0.75])))
-        tolerance = width * BESIDE * yardstick.noise
-        unused = np.broadcast_to(arc.tangent, points[near].shape)
-        arc = fit_arc(arc, points[near], unused, 0.0, tolerance, False, shares=share[near] / share.max())
+        points, shares = places.points[near], places.shares[near] / longest
+        arc = fit_arc(arc, points, np.broadcast_to(arc.tangent, points.shape), 0.0, tolerance, False, shares=shares)
         if not 0.5 < arc.curvature * shape.radii[0] < 2.0:
             return None
         circle = arc.over(0.0, arc.round).shape()

@@ -103,9 +103,9 @@ class Claims:
         np.minimum.at(rivals, edgels[others], distances[others])
         return Claims(owners, nearest, rivals)
 
-    def beside(self, edge):
-        """(e,) px from the nearest edge other than this one."""
-        return np.where(self.owners == edge, self.rivals, self.distances)
+    def beside(self, edges, edgels=slice(None)):
+        """(e,) px from the nearest edge other than a given one, or than (e,) `edges`; of some edgels only, if given."""
+        return np.where(self.owners[edgels] == edges, self.rivals[edgels], self.distances[edgels])
 
 
 @dataclass(frozen=True)
@@ -219,10 +219,12 @@ def steadiness(matching, support):
     about = min(ABOUT * tight, MOST_ABOUT_PX)
     views = slice(0, matching.edgels.view_count)
     edgels, residuals, _ = matching.matches(samples.points, samples.directions, views, about)
-    owners = np.append(support.claims.owners, len(samples.starts))[edgels]
-    mine = (edgels >= 0) & ((owners < 0) | (owners == samples.edges[:, None]))
-    on = mine & (np.abs(residuals) <= tight)
-    return samples.sums(on.sum(axis=1)) / np.maximum(samples.sums(mine.sum(axis=1)), 1)
+    at, view = np.nonzero(edgels >= 0)
+    owners = support.claims.owners[edgels[at, view]]
+    mine = (owners < 0) | (owners == samples.edges[at])
+    on = mine & (np.abs(residuals[at, view]) <= tight)
+    numbers, count = samples.edges[at], len(samples.starts) - 1
+    return np.bincount(numbers[on], minlength=count) / np.maximum(np.bincount(numbers[mine], minlength=count), 1)
 
 
 def support_share(matching, support):
@@ -243,11 +245,27 @@ def support_along(matching, shape, parameters, claims=None, own=-1):
     parameters: (n,) of the places. claims: Claims of all edges, whose edgels do not count unless they are this shape's
     or farther from all others than from it. own: the index of this shape among those, if it is one of them.
     """
-    edgels, residuals = _matches(matching, shape.at(parameters), shape.tangents(parameters), MATCH_PX)
+    return support_of_places(matching, [(shape, parameters)], claims, [own])[0]
+
+
+def support_of_places(matching, places, claims=None, owns=()):
+    """`support_along` for many shapes at once. places: [(shape, parameters)]. owns: the index of each of the shapes.
+
+    A kernel takes as long to start as to look up some hundred places.
+    """
+    if not places:
+        return []
+    points = np.concatenate([shape.at(parameters) for shape, parameters in places])
+    directions = np.concatenate([shape.tangents(parameters) for shape, parameters in places])
+    counts = np.array([len(parameters) for _, parameters in places])
+    edgels, residuals = _matches(matching, points, directions, MATCH_PX)
     if claims is not None:
-        others = np.append(claims.beside(own), np.inf)[edgels]
-        edgels = np.where(np.abs(residuals) + TIE_PX < others, edgels, -1)
-    return _weights(matching, edgels, residuals).sum(axis=1)
+        at, view = np.nonzero(edgels >= 0)
+        others = claims.beside(np.repeat(owns, counts)[at], edgels[at, view])
+        lost = np.abs(residuals[at, view]) + TIE_PX >= others
+        edgels[at[lost], view[lost]] = -1
+    views = _weights(matching, edgels, residuals).sum(axis=1)
+    return np.split(views, np.cumsum(counts)[:-1])
 
 
 def chance_weight(matching):
@@ -255,14 +273,11 @@ def chance_weight(matching):
 
     From how densely the edgels fill the part of each image where there are any, a pixel of an edge each.
     """
-    total, edgels = 0.0, matching.edgels
+    total = 0.0
     width = 0.5 * np.pi * matching.scale_px  # integral of Geman and McClure's weight over the distance
     turned = 2 * np.arcsin(MOST_SINE) / np.pi  # share of the directions that an edgel agrees with
-    for view in range(edgels.view_count):
-        points, _, strengths = edgels.of_view(view)
-        if len(points):
-            area = np.prod(np.ptp(points, axis=0) + 1.0)
-            total += float(strengths.sum() * width * turned / area)
+    for strengths, area in matching.densities:
+        total += float(strengths * width * turned / area)
     return total
 
 
@@ -275,5 +290,6 @@ def _matches(matching, points, directions, radius):
 
 def _weights(matching, edgels, residuals):
     """(n, V) strength times closeness of matched edgels, 0 where there is none."""
-    strengths = np.append(matching.edgels.strengths, np.float32(0))[edgels]
-    return strengths / (1.0 + (residuals / matching.scale_px) ** 2) ** 2
+    weights, at = np.zeros(edgels.shape, np.float32), edgels >= 0
+    weights[at] = matching.edgels.strengths[edgels[at]] / (1.0 + (residuals[at] / matching.scale_px) ** 2) ** 2
+    return weights

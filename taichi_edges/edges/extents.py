@@ -17,13 +17,41 @@ def extended(shape, sides, seen, pixel):
 
     seen: function of a shape and (n,) parameters: how many views see an edge there that is nobody else's.
     """
+    return all_extended([shape], [sides], lambda numbers, places: [seen(*places[0])], pixel)[0]
+
+
+def all_extended(shapes, sides, seen, pixel):
+    """`extended` for shapes with the sides of each, one step of all of them at a time.
+
+    seen: function of the indices of some shapes and [(shape, parameters)] as these are by now.
+    """
+    found = list(shapes)
+    steps = {n: _steps(shape, own, pixel) for n, (shape, own) in enumerate(zip(shapes, sides, strict=True)) if own}
+    answers = dict.fromkeys(steps)
+    while steps:
+        questions = {}
+        for number, generator in list(steps.items()):
+            try:
+                questions[number] = generator.send(answers[number])
+            except StopIteration as done:
+                found[number] = done.value
+                del steps[number]
+        asked = seen(list(questions), list(questions.values())) if questions else []
+        answers = dict(zip(questions, asked, strict=True))
+    return found
+
+
+def _steps(shape, sides, pixel):
+    """Generator that asks how many views see places, (shape, parameters), and returns the extended shape."""
     if shape.kind not in ("line", "arc"):
         return shape
     inside = np.linspace(0.05, 0.95, max(int(shape.length / pixel), 5))
-    least = max(GAP_SEEN * np.median(seen(shape, inside)), LEAST_GAP_VIEWS)
+    least = max(GAP_SEEN * np.median((yield shape, inside)), LEAST_GAP_VIEWS)
+    ways = np.arange(1.0, AHEAD_PX + 1.0) * pixel
     for side in sides:
         for _ in range(ROUNDS):
-            ahead = shown(shape, side, seen, pixel, least)
+            views = yield shape, side + (2 * side - 1) * ways / shape.length
+            ahead = shown(ways, views >= least, pixel)
             if ahead <= 0 or turned_round(shape, ahead):
                 break
             shape = grown(shape, side, ahead)
@@ -32,10 +60,8 @@ def extended(shape, sides, seen, pixel):
     return shape
 
 
-def shown(shape, side, seen, pixel, least):
-    """Length beyond an end that the images show."""
-    ways = np.arange(1.0, AHEAD_PX + 1.0) * pixel
-    good = seen(shape, side + (2 * side - 1) * ways / shape.length) >= least
+def shown(ways, good, pixel):
+    """Length beyond an end that the images show. ways: (n,) from it, a pixel apart. good: (n,) bool, seen there?"""
     last, lost = 0.0, 0.0
     for way, seen_here in zip(ways, good, strict=True):
         lost = 0.0 if seen_here else lost + pixel

@@ -30,8 +30,8 @@ def free_curves(cloud, pieces, config):
         piece_at[piece.own] = number
     traversed = grow_clusters(cloud.points, cloud.directions, config)
     for members in members_of_clusters(separate_branches(cloud.points, traversed, config.min_points)):
-        inside = np.bincount(piece_at[members] + 1, minlength=len(pieces) + 1)[1:]
-        own = [number for number in np.flatnonzero(inside) if inside[number] >= WITHIN * len(pieces[number].own)]
+        inside = zip(*np.unique(piece_at[members], return_counts=True), strict=True)
+        own = [number for number, count in inside if number >= 0 and count >= WITHIN * len(pieces[number].own)]
         members = members[np.isin(piece_at[members], [-1, *own])]
         if len(own) >= 2 and not any(pieces[number].closed for number in own):  # a circle is no part of a chain
             cost = cost_of_pieces(cloud, [pieces[number] for number in own], members)

@@ -10,7 +10,6 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from taichi_edges.edges.arc_growth import INLIER, SAGITTA, sagitta
 from taichi_edges.edges.arcs import Arc, fit_arc
@@ -78,22 +77,24 @@ def merged(cloud, claims, noises):
     """
     cloud = cloud.with_noises(noises)
     pieces = {number: piece_of(cloud, claim.arc, claim.own, claim.shared) for number, claim in enumerate(claims)}
-    waiting, turns, count = [], itertools.count(), len(pieces)
+    waiting, turns, count, ends = [], itertools.count(), len(pieces), EndGrid(cloud.scale.gap)
 
     def propose(some):
-        for a, b in joints(cloud, pieces, some):
+        for number in some:
+            ends.add(number, pieces[number])
+        for a, b in joints(cloud, pieces, ends, some):
             gain, piece = joined(cloud, pieces[a[0]], pieces[b[0]], a[1], b[1])
             if gain > 0:
                 heapq.heappush(waiting, (-gain, a[0], b[0], next(turns), piece))
 
-    propose(set(pieces))
+    propose(list(pieces))
     while waiting:
         _, a, b, _, piece = heapq.heappop(waiting)
         if a in pieces and b in pieces:
             del pieces[a], pieces[b]
             pieces[count] = piece
             count += 1
-            propose({count - 1})
+            propose([count - 1])
     return [pieces[number] for number in sorted(pieces)]
 
 
@@ -110,18 +111,44 @@ def capped(squared, noises):
     return float(np.minimum(squared / noises**2, OUTLIER).sum())
 
 
-def joints(cloud, pieces, some):
-    """Pairs of ends that are near and look at each other, each (number of the piece, 0 or 1); one of them in `some`."""
-    numbers = [number for number, piece in pieces.items() if not piece.closed]
-    if len(numbers) < 2:
-        return []
-    places, tangents = (np.concatenate(part) for part in zip(*(pieces[n].ends() for n in numbers), strict=True))
-    found = []
-    for i, j in sorted(cKDTree(places).query_pairs(cloud.scale.gap)):
-        a, b = numbers[i // 2], numbers[j // 2]
-        if a != b and (a in some or b in some) and tangents[i] @ tangents[j] <= -cloud.scale.cosine:
-            found.append(((a, i % 2), (b, j % 2)))
-    return found
+class EndGrid:
+    """The ends of open pieces in cubes of side `reach`: which are near an end is asked again after every joining."""
+
+    def __init__(self, reach):
+        self.reach, self.ends, self.cells = reach, {}, {}
+
+    def add(self, number, piece):
+        """Add the two ends of a Piece of some number, if it has any."""
+        if not piece.closed:
+            for side, (place, tangent) in enumerate(zip(*piece.ends(), strict=True)):
+                self.ends[number, side] = place, tangent
+                self.cells.setdefault(self._cell(place), []).append((number, side))
+
+    def near(self, end):
+        """Ends (number, side) within reach of one of them, itself included."""
+        place = self.ends[end][0]
+        corner = np.array(self._cell(place)) - 1
+        cells = (tuple(cell) for cell in (corner + np.indices((3, 3, 3)).reshape(3, -1).T).tolist())
+        around = [other for cell in cells for other in self.cells.get(cell, ())]
+        apart = np.linalg.norm([self.ends[other][0] - place for other in around], axis=1)
+        return [other for other, distance in zip(around, apart, strict=True) if distance <= self.reach]
+
+    def _cell(self, place):
+        return tuple(np.floor(place / self.reach).astype(int).tolist())
+
+
+def joints(cloud, pieces, grid, some):
+    """Pairs of ends that are near and look at each other, each (number of the piece, 0 or 1); one of them in `some`.
+
+    grid: EndGrid of all pieces, and of some that are gone.
+    """
+    found = set()
+    for end in [(number, side) for number in some if not pieces[number].closed for side in (0, 1)]:
+        for other in grid.near(end):
+            facing = grid.ends[end][1] @ grid.ends[other][1] <= -cloud.scale.cosine
+            if other[0] != end[0] and other[0] in pieces and facing:
+                found.add((min(end, other), max(end, other)))
+    return sorted(found)
 
 
 def joined(cloud, a, b, end_a, end_b):
@@ -180,8 +207,9 @@ def chained(cloud, a, b, end_a, end_b, members):
     after = (along_b - ends_b[end_b]) * (-1 if end_b else 1)
     (places_a, outwards), (places_b, _) = a.ends(), b.ends()
     after = after + (places_b[end_b] - places_a[end_a]) @ outwards[end_a]
-    arc = np.zeros(len(cloud.points))
-    arc[b.members] = after
-    arc[a.members] = before
-    arc = arc[members] - arc[members].min()
+    order = np.argsort(members, kind="stable")
+    arc = np.zeros(len(members))
+    for piece, along in ((b, after), (a, before)):
+        arc[order[np.searchsorted(members, piece.members, sorter=order)]] = along
+    arc -= arc.min()
     return Ordering(arc, float(arc.max()), False)

@@ -7,7 +7,7 @@ tolerance that is raised until it no longer cuts off what it measures.
 
 import numpy as np
 
-from taichi_edges.edges.arc_growth import Cloud, Scale, bent_from, grown_from_neighbors
+from taichi_edges.edges.arc_growth import Cloud, Scale, grown_from_seeds
 
 PROBES = 20  # seeds from which lines and arcs are grown
 LONGEST = 0.5  # share of these that tell the noise; the others may be bits of freer curves, which are off by more
@@ -31,7 +31,8 @@ def measured_scale(points, directions, neighbors, seeds, gap):
     cloud = Cloud(points, directions, Scale(noise, turn, gap))
     while noise < MOST_NOISE:
         cloud = cloud.at_scale(Scale(noise, turn, gap))
-        found = [pair for probe in probes for pair in _residuals(cloud, neighbors, probe)]
+        grown = grown_from_seeds(cloud, neighbors, probes)
+        found = [residual for pair in grown for residual in _residuals(cloud, pair)]
         if found:
             lengths, noises, turns = np.array(found).T
             longest = np.argsort(-lengths, kind="stable")[: max(int(LONGEST * len(lengths)), 1)]
@@ -42,11 +43,9 @@ def measured_scale(points, directions, neighbors, seeds, gap):
     return Scale(noise, turn, gap)
 
 
-def _residuals(cloud, neighbors, probe):
+def _residuals(cloud, pair):
     """(length, noise of the places, noise of the directions) of the line and the arc grown from one seed."""
-    line = grown_from_neighbors(cloud, neighbors, probe, straight=True)
-    arc = bent_from(cloud, line) if line is not None else None
-    for grown in (line, arc):
+    for grown in pair if pair[0] is not None else ():
         if grown is not None:
             members, along, squared = cloud.inliers(grown, grown.low, grown.high)
             if not len(members):

@@ -8,8 +8,16 @@ import numpy as np
 from taichi_edges.edges.adjustment import adjusted
 from taichi_edges.edges.completion import completed
 from taichi_edges.edges.continuation import Merging, continued
-from taichi_edges.edges.evidence import claims_of, evidence_of, steadiness, support_along, support_of, support_share
-from taichi_edges.edges.extents import extended
+from taichi_edges.edges.evidence import (
+    claims_of,
+    evidence_of,
+    steadiness,
+    support_along,
+    support_of,
+    support_of_places,
+    support_share,
+)
+from taichi_edges.edges.extents import all_extended
 from taichi_edges.edges.junctions import connected
 from taichi_edges.edges.model_selection import Yardstick
 from taichi_edges.edges.regularities import found_relations, regularised
@@ -120,9 +128,9 @@ def with_longer_ends(matching, shapes):
     """The shapes, ends that would meet no other extended as far as the images show them."""
     wireframe, claims = connected(shapes, matching.pixel), claims_of(matching, shapes)
     degrees = wireframe.degrees
-    longer = []
-    for number, (shape, edge) in enumerate(zip(shapes, wireframe.edges, strict=True)):
-        free = [side for side, end in enumerate(edge.vertices) if degrees[end] == 1]
-        seen = partial(support_along, matching, claims=claims, own=number)
-        longer.append(extended(shape, free, seen, matching.pixel) if free else shape)
-    return longer
+    free = [[side for side, end in enumerate(edge.vertices) if degrees[end] == 1] for edge in wireframe.edges]
+
+    def seen(numbers, places):
+        return support_of_places(matching, places, claims, numbers)
+
+    return all_extended(shapes, free, seen, matching.pixel)

@@ -27,20 +27,21 @@ class EdgelGrid:
     """The edgels of all views in cells of CELL x CELL pixels, for look-ups by kernels.
 
     starts: (V * rows * columns + 1,) int32, where each cell begins in `elements` (n, 4): u, v and the unit normal.
-    strengths: (n,) float32 of the elements. order: (n,) the index in Edgels of each element. rows, columns: cells
-    in a view.
+    strengths: (n,) float32 of the elements. order: (n + 1,) int32, the index in Edgels of each element, then -1 for
+    none. rows, columns: cells in a view.
     """
 
     def __init__(self, edgels, height, width):
         self.rows, self.columns = -(-height // CELL), -(-width // CELL)
         inside = np.clip(np.floor(edgels.points / CELL).astype(np.int64), 0, [self.columns - 1, self.rows - 1])
         cells = (edgels.views * self.rows + inside[:, 1]) * self.columns + inside[:, 0]
-        self.order = np.argsort(cells, kind="stable")
+        order = np.argsort(cells, kind="stable")
         counts = np.bincount(cells, minlength=edgels.view_count * self.rows * self.columns)
         self.starts = upload(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32))
-        elements = np.concatenate([edgels.points, edgels.normals], axis=1)[self.order]
+        elements = np.concatenate([edgels.points, edgels.normals], axis=1)[order]
         self.elements = upload(elements.astype(np.float32))
-        self.strengths = upload(edgels.strengths[self.order].astype(np.float32))
+        self.strengths = upload(edgels.strengths[order].astype(np.float32))
+        self.order = np.append(order.astype(np.int32), np.int32(-1))
 
 
 class EdgelMatching:
@@ -66,6 +67,12 @@ class EdgelMatching:
         near = np.where(np.isfinite(distances), near, own)
         beside = np.abs(np.einsum("nkc,nc->nk", points[near] - points[:, None], self.edgels.normals))
         return np.where(beside <= OWNED_BESIDE_PX, near, own)
+
+    @cached_property
+    def densities(self):
+        """[(sum of strengths, px^2)] of the edgels of each view that has any, and of the box around them."""
+        views = [self.edgels.of_view(view) for view in range(self.edgels.view_count)]
+        return [(some.sum(), np.prod(np.ptp(points, axis=0) + 1.0)) for points, _, some in views if len(points)]
 
     def equations(self, points, directions, radius, scale):
         """(n, EQUATIONS) float32 normal equations of where the points are, see `add_equations`.
@@ -124,8 +131,7 @@ class EdgelMatching:
                 residuals,
             )
         found = download(found)
-        order = np.append(self.grid.order.astype(np.int32), np.int32(-1))
-        return order[np.maximum(found, -1)], download(residuals), found > -2
+        return self.grid.order[np.maximum(found, -1)], download(residuals), found > -2
 
 
 @ti.func
