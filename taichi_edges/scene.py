@@ -216,6 +216,9 @@ class RefineConfig(Section):
     """From single edges to a connected wireframe that agrees with the images (beyond the paper)."""
 
     enabled: bool = Field(False, description="false: the edges stay as they were fitted")
+    anchor: bool = Field(
+        False, description="hang up straight edges whose depth the views cannot tell on known ones that they meet"
+    )
     regularise: bool = Field(
         False, description="make edges parallel, perpendicular, coplanar, coaxial, of equal radius, if images allow"
     )

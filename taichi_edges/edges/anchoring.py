@@ -8,28 +8,29 @@ met in the image alone, and is outvoted. Then the other views have to show the l
 explain the same edgels the best founded one stays.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from taichi_edges.cameras import NEAR
-from taichi_edges.edges.evidence import claims_of
+from taichi_edges.edges.evidence import support_of
 from taichi_edges.kernels.device import download
-from taichi_edges.kernels.edgel_matching import APART
 from taichi_edges.shapes import Line
 
-LINKED_PX, LINKED_BESIDE_PX, LINKED_SINE = 1.6, 0.5, 0.25  # edgels of one 2D edge: apart, to the side, turned
+LINKED_PX, LINKED_BESIDE_PX, LINKED_SINE = 1.6, 0.8, 0.25  # edgels of one 2D edge: apart, to the side, turned
 BEND_PX = 0.8  # an edgel farther from the straight line through a run of them shows that it bends
 SPLITS = 12  # rounds in which bent runs are halved
 BRIDGED_PX = 12.0  # gap in a straight run where another edge crosses it
+BRIDGINGS = 6  # rounds in which pairs of parts are joined
 LEAST_LENGTH_PX = 15.0  # of a straight run
-LEAST_EDGELS = 10  # of it
-BEYOND_PX = 4.0  # by which detectors lose the ends of an edge near a corner
+LEAST_EDGELS = 5  # of a part of one
+BEYOND_PX = 8.0  # between the ends of edges that meet, see `junctions.REACH_PX`
 LEAST_CROSSING = 0.3  # sine of the angle in the image at which an anchor is met
-PLACE_PX, SHAPE_PX, CLOSE_PX = 4.0, 1.5, 6.0  # spacing of places on runs and on shapes, how near they are to be looked at
+PLACE_PX, SHAPE_PX = 4.0, 1.5  # spacing of the places on runs and on shapes
+CLOSE_PX = 6.0  # where such places are so near, runs may meet shapes
 AGREEING_PX = 2.0  # from a line in space, an anchor on it
 APART_SHARE = 0.5  # of a run's length: anchors nearer to each other do not tell its slope in depth
 MOST_ANCHORS = 12  # of a run, evenly chosen
@@ -38,7 +39,10 @@ SPACING_PX = 2.0  # of the places where the views are asked
 SHOWN_PX = 1.2  # an edgel so near to the projection shows the line
 LEAST_VIEWS = 3  # that show it
 SHOWN = 0.6  # of its length in each of them
+EXPECTED = 0.5  # share of the views that show its anchors' shapes which show the line, too
 CLAIMED = 0.5  # share of its edgels that better lines explain already: it repeats them
+LEAST_VOTES, LEAST_WORTH = 2, 4  # views that propose a line; with the number of its ends that are anchors
+OVERLAP, SAME_PX = 0.4, 3.0  # share of common edgels of two lines for one edge; px in space, up to which they agree
 REPEAT_PX = 1.5  # in space, between lines that are parts of one
 
 
@@ -46,11 +50,11 @@ def anchored_lines(matching, shapes):
     """Lines that meet known shapes and that the views show where these say. matching: EdgelMatching. list of Line."""
     if not shapes:
         return []
-    cameras = Cameras.of(matching)
-    free = claims_of(matching, shapes).owners < 0
+    support = support_of(matching, shapes)
+    free = support.claims.owners < 0
     runs = runs_of(matching.edgels, free)
-    anchors = anchors_of(runs, shapes, cameras, matching.pixel)
-    lines = shown(matching, hypotheses(runs, anchors), free)
+    anchors = anchors_of(runs, shapes, Cameras.of(matching), matching.pixel)
+    lines = shown(matching, hypotheses(runs, anchors), free, seen_in(support))
     return distinct(lines, matching, free)
 
 
@@ -102,6 +106,10 @@ class Runs:
     def along(self):
         """(n, 2) unit vectors."""
         return (self.ends[:, 1] - self.ends[:, 0]) / np.maximum(self.lengths, 1e-300)[:, None]
+
+    def keep(self, chosen):
+        """Only the chosen ones. chosen: (n,) bool or indices."""
+        return Runs(self.views[chosen], self.ends[chosen])
 
 
 def runs_of(edgels, free):
@@ -166,16 +174,30 @@ def straightened(points, labels):
 
 
 def halved(points, labels, means, axes):
-    """(n,) bool, whether a run bends; and (m,) labels of its halves, cut at the point that is farthest off."""
-    offsets = points - means[labels]
-    way = (offsets * axes[labels]).sum(axis=1)
-    off = np.abs(offsets[:, 0] * axes[labels, 1] - offsets[:, 1] * axes[labels, 0])
-    order = np.lexsort((off, labels))  # the last of each run is the farthest off
-    last = np.flatnonzero(np.diff(labels[order], append=-1))
-    farthest, low, high = order[last], extremes(way, labels, np.minimum), extremes(way, labels, np.maximum)
-    share = (way[farthest] - low) / np.maximum(high - low, 1e-300)
-    cut = np.where((share > 0.2) & (share < 0.8), way[farthest], 0.5 * (low + high))
-    return off[farthest] > BEND_PX, 2 * labels + (way > cut[labels])
+    """(n,) bool, whether a run bends; and (m,) labels of its halves, cut where it is farthest from its chord."""
+    way = ((points - means[labels]) * axes[labels]).sum(axis=1)
+    first, last = (farthest(sign * way, labels) for sign in (-1.0, 1.0))
+    off = off_lines(points, means[labels], axes[labels])
+    bent = off[farthest(off, labels)] > BEND_PX
+    chords = points[last] - points[first]
+    chords = chords / np.maximum(np.linalg.norm(chords, axis=1, keepdims=True), 1e-300)
+    corner = way[farthest(off_lines(points, points[first][labels], chords[labels]), labels)]
+    low, high = way[first], way[last]
+    inside = np.minimum(corner - low, high - corner) > LINKED_PX
+    cut = np.where(inside, corner, 0.5 * (low + high))
+    return bent, 2 * labels + (way > cut[labels])
+
+
+def off_lines(points, starts, along):
+    """(n,) distances of points (n, 2) from lines through (n, 2) points along (n, 2) unit vectors."""
+    offsets = points - starts
+    return np.abs(offsets[:, 0] * along[:, 1] - offsets[:, 1] * along[:, 0])
+
+
+def farthest(values, labels):
+    """(n,) index of the greatest of the values (m,) with each label."""
+    order = np.lexsort((values, labels))
+    return order[np.flatnonzero(np.diff(labels[order], append=-1))]
 
 
 def extremes(values, labels, function):
@@ -211,30 +233,35 @@ def ends_of(points, labels, means, axes):
 
 def bridged(ends, moments):
     """The ends of runs, those that continue each other on one straight line joined. moments: (n, 6) of their points."""
-    first, second = continuing(ends)
-    labels = components(len(ends), first, second)
-    means, axes = axes_of(np.column_stack([np.bincount(labels, column) for column in moments.T]))
-    offsets = ends - means[labels][:, None]
-    off = np.abs(offsets[..., 0] * axes[labels, None, 1] - offsets[..., 1] * axes[labels, None, 0]).max(axis=1)
-    bent = extremes(off, labels, np.maximum) > BEND_PX
-    own = np.where(bent[labels], len(ends) + np.arange(len(ends)), labels)  # what bends stays in its parts
-    labels = np.unique(own, return_inverse=True)[1]
-    means, axes = axes_of(np.column_stack([np.bincount(labels, column) for column in moments.T]))
-    return ends_of(ends.reshape(-1, 2), np.repeat(labels, 2), means, axes)
+    for _ in range(BRIDGINGS):
+        first, second = continuing(ends)
+        if not len(first):
+            break
+        labels = np.arange(len(ends))
+        labels[second] = first
+        labels = np.unique(labels, return_inverse=True)[1]
+        moments = np.column_stack([np.bincount(labels, column) for column in moments.T])
+        ends = ends_of(ends.reshape(-1, 2), np.repeat(labels, 2), *axes_of(moments))
+    return ends
 
 
 def continuing(ends):
-    """Pairs of runs that continue each other, first and second (k,)."""
+    """Pairs of runs that continue each other, first and second (k,): each the other's best."""
     places, outer = ends.reshape(-1, 2), ends[:, ::-1].reshape(-1, 2)
     a, b = cKDTree(places).query_pairs(BRIDGED_PX, output_type="ndarray").T
     chord = outer[b] - outer[a]
-    length = np.maximum(np.linalg.norm(chord, axis=1), 1e-300)
-    chord = chord / length[:, None]
-    near, far = ((places[end] - outer[a]) for end in (a, b))
-    off = [np.abs(way[:, 0] * chord[:, 1] - way[:, 1] * chord[:, 0]) for way in (near, far)]
-    ahead = (near * chord).sum(axis=1) <= (far * chord).sum(axis=1)
-    good = (a // 2 != b // 2) & ahead & (np.maximum(*off) <= BEND_PX)
-    return a[good] // 2, b[good] // 2
+    chord = chord / np.maximum(np.linalg.norm(chord, axis=1, keepdims=True), 1e-300)
+    off = np.maximum(*(off_lines(places[end], outer[a], chord) for end in (a, b)))
+    ahead = ((places[b] - places[a]) * chord).sum(axis=1) >= -LINKED_PX
+    good = (a // 2 != b // 2) & ahead & (off <= BEND_PX)
+    a, b = a[good] // 2, b[good] // 2
+    order = np.lexsort((b, a, off[good]))
+    a, b, rank = a[order], b[order], np.arange(len(order))
+    best = np.full(len(ends), len(order))
+    for run in (a, b):
+        np.minimum.at(best, run, rank)
+    mutual = (best[a] == rank) & (best[b] == rank)
+    return a[mutual], b[mutual]
 
 
 # --------------------------------------------------------------------------------------------------------- anchors
@@ -359,11 +386,14 @@ class Lines:
     """Lines in space that are proposed for runs.
 
     points: (n, 2, 3) two anchors that they pass through. extents: (n, 2) parameters of their ends, 0 and 1 at these.
-    agreeing: (n,) number of anchors on it. sizes: (n,) of a pixel there, unit-cube units.
+    shapes: (n, 2) those that these are on. views: (n,) of the runs. agreeing: (n,) number of anchors on the line.
+    sizes: (n,) of a pixel there, unit-cube units.
     """
 
     points: np.ndarray
     extents: np.ndarray
+    shapes: np.ndarray
+    views: np.ndarray
     agreeing: np.ndarray
     sizes: np.ndarray
 
@@ -381,6 +411,12 @@ class Lines:
         return self.points[:, :1] + self.extents[:, :, None] * self.ways[:, None]
 
     @property
+    def at_anchors(self):
+        """(n, 2) bool: is an end as near to its anchor as edges are that meet?"""
+        off = np.abs(self.extents - [0.0, 1.0]) * np.linalg.norm(self.ways, axis=1)[:, None]
+        return off <= BEYOND_PX * self.sizes[:, None]
+
+    @property
     def lengths(self):
         """(n,) unit-cube units."""
         return (self.extents[:, 1] - self.extents[:, 0]) * np.linalg.norm(self.ways, axis=1)
@@ -392,7 +428,8 @@ class Lines:
     @staticmethod
     def joined(several):
         """All of some Lines."""
-        nothing = Lines(np.zeros((0, 2, 3)), np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0))
+        counts = np.zeros((0, 2), np.int64), *np.zeros((2, 0), np.int64)
+        nothing = Lines(np.zeros((0, 2, 3)), np.zeros((0, 2)), *counts, np.zeros(0))
         columns = ([getattr(lines, field.name) for lines in (nothing, *several)] for field in fields(Lines))
         return Lines(*map(np.concatenate, columns))
 
@@ -405,12 +442,13 @@ def hypotheses(runs, anchors):
         chosen = np.flatnonzero(counts == count if count < MOST_ANCHORS else counts >= count)
         share = np.arange(count) / (count - 1)
         rows = starts[chosen, None] + np.round(share * (counts[chosen, None] - 1)).astype(np.int64)
-        several += proposed(runs.lengths[chosen], anchors.points[rows], anchors.ways[rows], anchors.sizes[rows])
+        several += proposed(runs.keep(chosen), anchors.keep(rows))
     return Lines.joined(several)
 
 
-def proposed(lengths, points, ways, sizes):
-    """Lists of Lines for (r,) runs with c anchors each. lengths: (r,) px. points: (r, c, 3). ways, sizes: (r, c)."""
+def proposed(runs, anchors):
+    """Lists of Lines for r Runs with c anchors each. anchors: Anchors with arrays (r, c, ..)."""
+    lengths, points, ways, sizes = runs.lengths, anchors.points, anchors.ways, anchors.sizes
     first, second = np.triu_indices(points.shape[1], 1)
     agree = on_lines(points, first, second, sizes)  # (r, p, c)
     far = ways[:, second] - ways[:, first]
@@ -424,7 +462,8 @@ def proposed(lengths, points, ways, sizes):
         chosen = (mine[:, None], ends)
         extents, usable = extents_of(lengths[mine], ways[chosen], sizes[chosen])
         count = agree[mine, pair].sum(axis=1)
-        found.append(Lines(points[chosen], extents, count, sizes[chosen].mean(axis=1)).keep(usable))
+        of = anchors.shapes[chosen], runs.views[mine], count, sizes[chosen].mean(axis=1)
+        found.append(Lines(points[chosen], extents, *of).keep(usable))
         implied = ~(agree & ~agree[rows, best][:, None]).any(axis=2)  # nothing agrees that does not with the best
         worth = np.where(implied, 0.0, worth)
     return found
@@ -489,15 +528,27 @@ class Sight:
         return np.stack(shown, axis=1) / np.maximum(total, 1)
 
 
-def shown(matching, lines, free):
-    """The Lines that enough views show, cut to where they do. free: (e,) bool, the edgels that no known shape has."""
+def seen_in(support):
+    """(S, V) bool: does a view show a shape, on half of its length? support: Support of the shapes."""
+    lengths = support.samples.lengths[:, None]
+    return support.samples.sums(lengths * (support.edgels >= 0)) >= 0.5 * support.samples.sums(lengths)
+
+
+def shown(matching, lines, free, seen):
+    """The Lines that enough views show, cut to where they do. free: (e,) bool, the edgels that no known shape has.
+
+    seen: (S, V) bool, which views show which shapes. A view that shows both shapes on which a line is anchored should
+    show it, too; where it has the depth of something in front of it, neighbouring views do and others do not.
+    """
     sight = Sight.of(matching, lines, free, SPACING_PX)
     enough = (sight.edgels >= 0).sum(axis=1) >= LEAST_VIEWS
     lines, kept = clipped(lines, sight, enough)
     lines = lines.keep(kept)
     sight = Sight.of(matching, lines, free, SPACING_PX)
-    views = (sight.shares(len(lines)) >= SHOWN).sum(axis=1)
-    return lines.keep(views >= LEAST_VIEWS)
+    views = sight.shares(len(lines)) >= SHOWN
+    expected = seen[lines.shapes].all(axis=1)
+    agreed = (views & expected).sum(axis=1) >= EXPECTED * expected.sum(axis=1)
+    return lines.keep(agreed & (views.sum(axis=1) >= LEAST_VIEWS))
 
 
 def clipped(lines, sight, enough):
@@ -516,10 +567,8 @@ def clipped(lines, sight, enough):
         step = (lines.extents[line, 1] - lines.extents[line, 0]) / (part.stop - part.start)
         extents[line] = lines.extents[line, 0] + step * np.array([first, last])
     shown = np.bincount(sight.lines, enough, len(lines)) > 0
-    near = BEYOND_PX * lines.sizes / np.linalg.norm(lines.ways, axis=1)
-    anchored = np.broadcast_to([0.0, 1.0], extents.shape)
-    extents = np.where(np.abs(extents - anchored) <= near[:, None], anchored, extents)
-    lines = Lines(lines.points, extents, lines.agreeing, lines.sizes)
+    lines = replace(lines, extents=extents)
+    lines = replace(lines, extents=np.where(lines.at_anchors, [0.0, 1.0], extents))
     return lines, shown & (lines.lengths >= LEAST_LENGTH_PX * lines.sizes)
 
 
@@ -527,27 +576,64 @@ def clipped(lines, sight, enough):
 
 
 def distinct(lines, matching, free):
-    """A list of Line: of those that explain the same edgels only the best founded one, as long as all its repeats."""
+    """A list of Line that several views propose. Each edgel is on one, the best founded one, which its repeats extend.
+
+    free: (e,) bool, the edgels that no known shape has.
+    """
     sight = Sight.of(matching, lines, free, 0.5 * SPACING_PX)
-    starts = np.searchsorted(sight.lines, np.arange(len(lines) + 1))
+    votes, worth, rival = ballot(lines, sight, len(free))
+    elected = (votes >= LEAST_VOTES) & (worth >= LEAST_WORTH) & (worth >= rival)
     support = np.bincount(sight.lines, (sight.edgels >= 0).sum(axis=1), len(lines))
-    order = np.lexsort((-support, -np.minimum(lines.agreeing, 4)))
-    owners, extents, kept = np.full(len(matching.edgels), -1), lines.extents.copy(), []
-    for line in order.tolist():
-        found = sight.edgels[starts[line] : starts[line + 1]]
-        found = np.unique(found[found >= 0])
-        claimed = owners[found]
-        if (claimed >= 0).mean() < CLAIMED:
-            kept.append(line)
-            owners[found[claimed < 0]] = line
+    starts = np.searchsorted(sight.lines, np.arange(len(lines) + 1))
+    owners, extents, kept = np.full(len(free), -1), lines.extents.copy(), []
+    for line in np.lexsort((-support, -worth)).tolist():
+        found = np.unique(sight.edgels[starts[line] : starts[line + 1]])
+        found = found[found >= 0]
+        others = owners[found]
+        if (others >= 0).mean() < CLAIMED:
+            if elected[line]:
+                kept.append(line)
+                owners[found[others < 0]] = line
             continue
-        best = int(np.bincount(claimed[claimed >= 0]).argmax())
-        way = lines.points[best, 1] - lines.points[best, 0]
-        offsets = lines.ends[line] - lines.points[best, 0]
-        along = offsets @ way / (way @ way)
-        apart = np.linalg.norm(offsets - along[:, None] * way, axis=1)
-        if apart.max() <= REPEAT_PX * lines.sizes[best]:
+        best = int(np.bincount(others[others >= 0]).argmax())
+        along, apart = beside(lines, np.array([best]), lines.ends[line][None])
+        if apart[0] <= REPEAT_PX * lines.sizes[best]:
             extents[best] = min(extents[best, 0], along.min()), max(extents[best, 1], along.max())
-            owners[found[claimed < 0]] = best
-    ends = Lines(lines.points, extents, lines.agreeing, lines.sizes).ends
+            owners[found[others < 0]] = best
+    ends = replace(lines, extents=extents).ends
     return [Line(ends[line]) for line in sorted(kept)]
+
+
+def ballot(lines, sight, count):
+    """(n,) number of views whose runs propose a line; (n,) that and the number of its ends that are anchors; (n,) the
+    greatest such number of the other lines for the same edgels.
+
+    Which known edges a run happens to cross in the image changes with the viewpoint, and so does where a line through
+    these would be; what it really touches does not. And edges end where they meet others. sight: of the Lines. count:
+    of edgels.
+    """
+    place, view = np.nonzero(sight.edgels >= 0)
+    shape, entries = (len(lines), count), np.ones(len(place), np.int32)
+    owned = csr_matrix((entries, (sight.lines[place], sight.edgels[place, view])), shape=shape)
+    owned.data[:] = 1
+    total, common = np.asarray(owned.sum(axis=1))[:, 0], (owned @ owned.T).tocoo()
+    alike = common.data >= OVERLAP * np.minimum(total[common.row], total[common.col])
+    one, other = common.row[alike], common.col[alike]
+    same = beside(lines, one, lines.ends[other])[1] <= SAME_PX * lines.sizes[one]
+    votes = voters(one[same], lines.views[other[same]], len(lines))
+    worth, rival = votes + lines.at_anchors.sum(axis=1), np.zeros(len(lines), np.int64)
+    np.maximum.at(rival, one[~same], worth[other[~same]])
+    return votes, worth, rival
+
+
+def voters(lines, views, count):
+    """(count,) number of different views that are paired with each of the lines."""
+    pairs = np.unique(np.column_stack([lines, views]), axis=0)
+    return np.bincount(pairs[:, 0], minlength=count)
+
+
+def beside(lines, chosen, points):
+    """(k, m) parameters on chosen Lines, (k,), of points (k, m, 3), and (k,) how far these are from them at most."""
+    way, offsets = lines.ways[chosen][:, None], points - lines.points[chosen, :1]
+    along = (offsets * way).sum(axis=2) / (way**2).sum(axis=2)
+    return along, np.linalg.norm(offsets - along[:, :, None] * way, axis=2).max(axis=1)
