@@ -84,6 +84,20 @@ def test_pipe_in_front_of_the_wall_pulls_nothing(taichi, generator, seed):
     assert Counter(found.tolist()) == Counter(range(len(level)))
 
 
+def test_what_hangs_on_anchored_lines_is_found_after_them(taichi, generator):
+    """A bar in the middle of a window meets nothing but the lintel and the sill."""
+    _, level = windows(np.random.default_rng(0))
+    upright, _ = windows(np.random.default_rng(0))
+    bars = level.mean(axis=1).reshape(-1, 2, 3)
+    curves = [line(*ends) for ends in (*upright, *level, *bars)]
+    matching = EdgelMatching(views_of(curves, generator, NOISE_PX, cameras=walk(), count=VIEWS))
+    found = anchored_lines(matching, [Line(ends) for ends in upright])
+    ends = np.array([sorted(each.points.tolist()) for each in found])
+    expected = np.array([sorted(each.tolist()) for each in (*level, *bars)])
+    apart = np.abs(ends[:, None] - expected).max(axis=(2, 3))
+    assert len(found) == len(expected) and apart.min(axis=0).max() <= 4 * matching.pixel
+
+
 def test_nothing_is_found_where_there_are_no_edgels(taichi, generator):
     upright, _ = windows(generator)
     views = views_of([line(*ends) for ends in upright], generator, NOISE_PX, cameras=walk(), count=VIEWS)

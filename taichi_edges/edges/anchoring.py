@@ -43,19 +43,29 @@ EXPECTED = 0.5  # share of the views that show its anchors' shapes which show th
 CLAIMED = 0.5  # share of its edgels that better lines explain already: it repeats them
 LEAST_VOTES, LEAST_WORTH = 2, 4  # views that propose a line; with the number of its ends that are anchors
 OVERLAP, SAME_PX = 0.4, 3.0  # share of common edgels of two lines for one edge; px in space, up to which they agree
+ROUNDS = 3
 REPEAT_PX = 1.5  # in space, between lines that are parts of one
 
 
 def anchored_lines(matching, shapes):
-    """Lines that meet known shapes and that the views show where these say. matching: EdgelMatching. list of Line."""
+    """Lines that meet known shapes and that the views show where these say. matching: EdgelMatching. list of Line.
+
+    What is found in one round is known in the next: a pane hangs on the frame that hangs on the wall.
+    """
     if not shapes:
         return []
-    support = support_of(matching, shapes)
-    free = support.claims.owners < 0
-    runs = runs_of(matching.edgels, free)
-    anchors = anchors_of(runs, shapes, Cameras.of(matching), matching.pixel)
-    lines = shown(matching, hypotheses(runs, anchors), free, seen_in(support))
-    return distinct(lines, matching, free)
+    cameras, support = Cameras.of(matching), support_of(matching, shapes)
+    runs, known = runs_of(matching.edgels, support.claims.owners < 0), list(shapes)
+    anchors = anchors_of(runs, known, cameras, matching.pixel)
+    for _ in range(ROUNDS):
+        free = support.claims.owners < 0
+        found = distinct(shown(matching, hypotheses(runs, anchors), free, seen_in(support)), matching, free)
+        if not found:
+            break
+        anchors = anchors.joined(anchors_of(runs, found, cameras, matching.pixel), len(known))
+        known += found
+        support = support_of(matching, known)
+    return known[len(shapes) :]
 
 
 # --------------------------------------------------------------------------------------------------------- cameras
@@ -288,6 +298,16 @@ class Anchors:
         """Only the chosen ones. chosen: (n,) bool or indices."""
         return Anchors(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
+    def sorted(self):
+        """The same in order of their runs, and along these."""
+        return self.keep(np.lexsort((self.ways, self.runs)))
+
+    def joined(self, other, count):
+        """These and those on further shapes, where there are `count` shapes so far."""
+        other = replace(other, shapes=other.shapes + count)
+        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+        return Anchors(*map(np.concatenate, pairs)).sorted()
+
 
 def anchors_of(runs, shapes, cameras, pixel):
     """The Anchors of Runs on shapes. pixel: unit-cube units."""
@@ -320,7 +340,7 @@ def once(anchors):
     anchors = anchors.keep(order)
     again = (np.diff(anchors.runs) == 0) & (np.diff(anchors.shapes) == 0) & (np.diff(anchors.ways) < 1.0)
     anchors = anchors.keep(np.append(True, ~again)[: len(anchors)])
-    return anchors.keep(np.lexsort((anchors.ways, anchors.runs)))
+    return anchors.sorted()
 
 
 @dataclass(frozen=True)
