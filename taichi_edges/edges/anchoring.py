@@ -41,7 +41,7 @@ LEAST_VIEWS = 3  # that show it
 SHOWN = 0.6  # of its length in each of them
 EXPECTED = 0.5  # share of the views that show its anchors' shapes which show the line, too
 CLAIMED = 0.5  # share of its edgels that better lines explain already: it repeats them
-LEAST_VOTES, LEAST_WORTH = 2, 4  # views that propose a line; with the number of its ends that are anchors
+LEAST_VOTES, LEAST_WORTH = 2, 3.0  # views that propose a line; with how many of its ends are anchors
 OVERLAP, SAME_PX = 0.4, 3.0  # share of common edgels of two lines for one edge; px in space, up to which they agree
 ROUNDS = 3
 REPEAT_PX = 1.5  # in space, between lines that are parts of one
@@ -406,15 +406,15 @@ class Lines:
     """Lines in space that are proposed for runs.
 
     points: (n, 2, 3) two anchors that they pass through. extents: (n, 2) parameters of their ends, 0 and 1 at these.
-    shapes: (n, 2) those that these are on. views: (n,) of the runs. agreeing: (n,) number of anchors on the line.
-    sizes: (n,) of a pixel there, unit-cube units.
+    shapes: (n, 2) those that these are on. views: (n,) of the runs. closed: (n,) how many ends of the run are anchors,
+    0 to 2, each the less the farther it is. sizes: (n,) of a pixel there, unit-cube units.
     """
 
     points: np.ndarray
     extents: np.ndarray
     shapes: np.ndarray
     views: np.ndarray
-    agreeing: np.ndarray
+    closed: np.ndarray
     sizes: np.ndarray
 
     def __len__(self):
@@ -448,8 +448,8 @@ class Lines:
     @staticmethod
     def joined(several):
         """All of some Lines."""
-        counts = np.zeros((0, 2), np.int64), *np.zeros((2, 0), np.int64)
-        nothing = Lines(np.zeros((0, 2, 3)), np.zeros((0, 2)), *counts, np.zeros(0))
+        counts = np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
+        nothing = Lines(np.zeros((0, 2, 3)), np.zeros((0, 2)), *counts, *np.zeros((2, 0)))
         columns = ([getattr(lines, field.name) for lines in (nothing, *several)] for field in fields(Lines))
         return Lines(*map(np.concatenate, columns))
 
@@ -481,8 +481,9 @@ def proposed(runs, anchors):
         ends = np.column_stack([first[pair], second[pair]])
         chosen = (mine[:, None], ends)
         extents, usable = extents_of(lengths[mine], ways[chosen], sizes[chosen])
-        count = agree[mine, pair].sum(axis=1)
-        of = anchors.shapes[chosen], runs.views[mine], count, sizes[chosen].mean(axis=1)
+        gaps = np.abs(ways[chosen] - np.stack([np.zeros(len(mine)), lengths[mine]], axis=1))
+        closed = np.maximum(1.0 - gaps / BEYOND_PX, 0.0).sum(axis=1)
+        of = anchors.shapes[chosen], runs.views[mine], closed, sizes[chosen].mean(axis=1)
         found.append(Lines(points[chosen], extents, *of).keep(usable))
         implied = ~(agree & ~agree[rows, best][:, None]).any(axis=2)  # nothing agrees that does not with the best
         worth = np.where(implied, 0.0, worth)
@@ -625,12 +626,12 @@ def distinct(lines, matching, free):
 
 
 def ballot(lines, sight, count):
-    """(n,) number of views whose runs propose a line; (n,) that and the number of its ends that are anchors; (n,) the
-    greatest such number of the other lines for the same edgels.
+    """(n,) number of views whose runs propose a line, (n,) that and how many of their ends are anchors, on average, and
+    (n,) the greatest such sum of the other lines for the same edgels.
 
     Which known edges a run happens to cross in the image changes with the viewpoint, and so does where a line through
-    these would be; what it really touches does not. And edges end where they meet others. sight: of the Lines. count:
-    of edgels.
+    these would be; what it really touches does not. And edges end where they meet others, in every view. sight: of the
+    Lines. count: of edgels.
     """
     place, view = np.nonzero(sight.edgels >= 0)
     shape, entries = (len(lines), count), np.ones(len(place), np.int32)
@@ -641,7 +642,8 @@ def ballot(lines, sight, count):
     one, other = common.row[alike], common.col[alike]
     same = beside(lines, one, lines.ends[other])[1] <= SAME_PX * lines.sizes[one]
     votes = voters(one[same], lines.views[other[same]], len(lines))
-    worth, rival = votes + lines.at_anchors.sum(axis=1), np.zeros(len(lines), np.int64)
+    closed = np.bincount(one[same], lines.closed[other[same]], len(lines))
+    worth, rival = votes + closed / np.maximum(np.bincount(one[same], minlength=len(lines)), 1), np.zeros(len(lines))
     np.maximum.at(rival, one[~same], worth[other[~same]])
     return votes, worth, rival
 
