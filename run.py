@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Parametric 3D edges from posed images: `python run.py scenes/abc_00000006.yaml`. Argument parsing only."""
+"""Parametric 3D edges from images: `python run.py scenes/demo.yaml` or `run.py my_photos/`. Argument parsing only."""
 
 import argparse
 import os
@@ -22,13 +22,14 @@ def parse_arguments(arguments=None):
         description="Recover the 3D edges of a scene: prepare, train, cluster, fit, evaluate, export.",
         epilog="A stage that is up to date is skipped, so the same command resumes an interrupted run.",
     )
-    parser.add_argument("scene", help="scene file, e.g. scenes/demo.yaml")
+    parser.add_argument("scene", help="scene file, e.g. scenes/demo.yaml, or a folder: COLMAP, nerfstudio, photos, ...")
     parser.add_argument("--stage", choices=STAGES, help="start with this stage, from the artefacts on disk")
     parser.add_argument("--until", choices=STAGES, help="stop after this stage")
     parser.add_argument("--data", metavar="FOLDER", help="data root for relative paths (default: TAICHI_EDGES_DATA)")
     parser.add_argument("--out", metavar="FOLDER", default="runs", help="results go to FOLDER/<scene> (default: runs)")
     parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="e.g. --set train.epochs=100")
     parser.add_argument("--preset", choices=("fast", "paper"), help="training schedule (default: the scene's, or fast)")
+    parser.add_argument("--scale", choices=("object", "building", "room"), help="settings for a scene of this size")
     parser.add_argument("--seed", type=int, help="seed of every random choice (default: the scene's)")
     parser.add_argument("--threads", type=int, help="CPU threads (default: all this process may use)")
     parser.add_argument("--arch", choices=("cpu", "cuda", "vulkan"), default="cpu", help="where the kernels run")

@@ -1,11 +1,18 @@
 """Files are written under a temporary name and renamed, so a killed run never leaves half a file under a final name."""
 
 import contextlib
+import errno
+import fcntl
 import functools
 import hashlib
 import json
 import os
 from pathlib import Path
+
+from taichi_edges.errors import UserError
+
+LOCK = ".lock"  # in the folder of a run, with the number of the process that writes there
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # of file systems that know none
 
 
 @contextlib.contextmanager
@@ -19,6 +26,34 @@ def replacing(path):
         os.replace(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def locked(folder):
+    """Nobody else writes into `folder` meanwhile; UserError where another run does so now.
+
+    The system gives the lock up when its process ends, however it ends. The file stays: were it removed, a third
+    process might lock a new one beside a second that still holds the old.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / LOCK, "a+", encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            file.seek(0)
+            owner = file.read().strip() or "unknown"
+            problem = f"another run, process {owner}, is writing into this folder"
+            raise UserError(f"{folder}: {problem}; wait for it, or choose another folder with --out") from error
+        except OSError as error:
+            if error.errno not in NO_LOCKS:
+                raise
+        file.truncate(0)
+        file.write(f"{os.getpid()}\n")
+        file.flush()
+        try:
+            yield
+        finally:
+            file.truncate(0)
 
 
 def remove_unfinished(folder):

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from taichi_edges.errors import UserError
@@ -14,11 +15,9 @@ MOST_THREADS = 256  # each has a plane of its own to draw into
 
 def run_command(options):
     """Run what the parsed command line `options` asks for; mistakes of the user raise UserError."""
-    config = load_scene(options.scene, options.preset, options.set, options.seed)
-    if options.show and options.until and list(STAGES).index(options.until) < list(STAGES).index("refine"):
-        raise UserError(
-            f"--show needs the edges, but --until {options.until} stops before refine; leave one of them out"
-        )
+    config = load_scene(options.scene, options.preset, options.set, options.seed, options.scale)
+    if options.show:
+        _refuse_vain_show(options.until)
     run = Run(
         config=config,
         folder=Path(options.out) / config.name,
@@ -27,10 +26,33 @@ def run_command(options):
         arch=options.arch,
         progress=make_progress(options.quiet),
     )
+    if config.source.reader == "auto":
+        run = with_reader(run)
     record = run_stages(run, options.stage, options.until)
     print_summary(run, record, options.until)
     if options.show:
         show(run)
+
+
+def _refuse_vain_show(until):
+    """UserError where --show cannot show anything in the end."""
+    from taichi_edges.exporters.viewer import has_display
+
+    if until and list(STAGES).index(until) < list(STAGES).index("refine"):
+        raise UserError(f"--show needs the edges, but --until {until} stops before refine; leave one of them out")
+    if not has_display():
+        problem = "--show: there is no display (neither DISPLAY nor WAYLAND_DISPLAY is set)"
+        raise UserError(f"{problem}; run without it and open edges.ply, edges.step or overlays.png")
+
+
+def with_reader(run):
+    """The run with the reader that fits what is at its source.path; says which it is."""
+    from taichi_edges.readers.recognition import recognised_source
+
+    path = run.data_path(run.config.source.path, "source.path")
+    source, found = recognised_source(path, run.config.source)
+    run.progress.say(f"{path}: read as {found}")
+    return replace(run, config=run.config.model_copy(update={"source": source}))
 
 
 def _data_root(option):

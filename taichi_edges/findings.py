@@ -13,11 +13,12 @@ def left_out(*amounts):
 
 
 def describe_prepare(facts):
-    """'12 views, 128 x 128 px, 9000 edgels, lines 2.4 px wide; maps shifted by (-0.55, -0.71) px: corrected'."""
+    """'9 views and 1 held out, 128 x 128 px, 9000 edgels, lines 2.4 px wide; maps shifted by (-0.55, -0.7) px: ...'."""
     part = f" of the synthetic part '{facts['part']}'" if "part" in facts else ""
     size = f"{facts['width_px']} x {facts['height_px']} px"
     lines = f"lines {facts['line_width_px']:.1f} px wide" if "line_width_px" in facts else "edges from the images"
-    found = f"{amount(facts['views'], 'view')}{part}, {size}, {amount(facts['edgels'], 'edgel')}, {lines}"
+    held_out = f" and {len(facts['held_out'])} held out" if facts["held_out"] else ""
+    found = f"{amount(facts['views'], 'view')}{held_out}{part}, {size}, {amount(facts['edgels'], 'edgel')}, {lines}"
     return f"{found}{describe_calibration(facts.get('calibration'))}"
 
 
@@ -102,13 +103,21 @@ def describe_relations(relations):
 
 
 def describe_evaluate(facts):
-    """'F-score 72.6 % at 5 mm, ..., 74.6 % at 20 mm; 7 of 8 corners closed'; '2 edges, ...' without truth."""
+    """'F-score 72.6 % at 5 mm, ..., 74.6 % at 20 mm; 7 of 8 corners closed; 3 views held out: ...'; '2 edges, ...'."""
     if facts["ground_truth"] is None:
         length, ends = f"{facts['predicted_length_units']:.2f} units long", amount(facts["free_ends"], "free end")
-        return f"{amount(facts['edges'], 'edge')}, {length}, {ends}; there is no ground truth"
+        return f"{amount(facts['edges'], 'edge')}, {length}, {ends}; there is no ground truth{describe_held_out(facts)}"
     shares = [f"{facts[f'f_score_{limit}mm_percent']:.1f} % at {limit} mm" for limit in (5, 10, 20)]
     corners = f"; {facts['corners_closed']} of {facts['corners']} corners closed" if facts.get("corners") else ""
-    return f"F-score {', '.join(shares)}{corners}"
+    return f"F-score {', '.join(shares)}{corners}{describe_held_out(facts)}"
+
+
+def describe_held_out(facts):
+    """'; 3 views held out: precision 93.1 %, recall 62.4 % of long edges', '' where none were."""
+    precision, recall = (facts.get(f"held_out_{share}_percent") for share in ("precision", "recall_long"))
+    shares = [f"precision {precision:.1f} %"] if precision is not None else []
+    shares += [f"recall {recall:.1f} % of long edges"] if recall is not None else []
+    return f"; {amount(facts['held_out_views'], 'view')} held out: {', '.join(shares)}" if shares else ""
 
 
 def describe_export(facts):

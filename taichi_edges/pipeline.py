@@ -22,7 +22,7 @@ import yaml
 
 import taichi_edges
 from taichi_edges import stages
-from taichi_edges.artefacts import digest, digest_file, remove_unfinished, write_json, write_text
+from taichi_edges.artefacts import digest, digest_file, locked, remove_unfinished, write_json, write_text
 from taichi_edges.errors import UserError
 from taichi_edges.findings import FINDINGS
 from taichi_edges.progress import Progress
@@ -55,9 +55,9 @@ class Stage:
 STAGES = {
     "prepare": Stage(
         stages.prepare,
-        ("source", "calibration", "box", "seed", "train.edge_threshold"),
+        ("source", "calibration", "box", "seed", "train.edge_threshold", "evaluation.held_out"),
         (),
-        ("views.npz",),
+        ("views.npz", "held_out.npz"),
         stages.source_files,
     ),
     "train": Stage(
@@ -82,7 +82,7 @@ STAGES = {
     "evaluate": Stage(
         stages.evaluate,
         ("evaluation",),
-        ("edges.json", "views.npz"),
+        ("edges.json", "views.npz", "held_out.npz"),
         ("metrics.json", "metrics.csv"),
         stages.truth_files,
     ),
@@ -155,24 +155,39 @@ def run_stages(run, start=None, until=None):
         raise UserError(f"--stage {start} comes after --until {until}; the order is {' '.join(names)}")
     for name in names[: last + 1]:
         STAGES[name].outside(run)  # a mistyped path must not come to light after the training
-    record = _open_record(run)
-    for name in names[:first]:
-        _refuse_stale(run, record, name)
-    for name in names[first : last + 1]:
-        _run_stage(run, record, name, force=start is not None)
+    with _own_folder(run):
+        record = _open_record(run)
+        for name in names[:first]:
+            _refuse_stale(run, record, name)
+        for name in names[first : last + 1]:
+            _run_stage(run, record, name, force=start is not None)
     return record
+
+
+@contextlib.contextmanager
+def _own_folder(run):
+    """The run's folder, ours alone; UserError where it cannot be."""
+    with contextlib.ExitStack() as stack:
+        with _explained_to_be_unwritable(run):
+            stack.enter_context(locked(run.folder))
+        yield
+
+
+@contextlib.contextmanager
+def _explained_to_be_unwritable(run):
+    try:
+        yield
+    except OSError as error:
+        problem = f"cannot be written to ({error.strerror})"
+        raise UserError(f"{run.folder}: {problem}; choose another folder with --out") from error
 
 
 def _open_record(run):
     """The run's record, with what is known before any stage: the resolved scene, versions, machine."""
     scene = run.config.model_dump()
-    try:
-        run.folder.mkdir(parents=True, exist_ok=True)
+    with _explained_to_be_unwritable(run):
         remove_unfinished(run.folder)
         write_text(run.path("scene.yaml"), yaml.safe_dump(scene, sort_keys=False))
-    except OSError as error:
-        problem = f"cannot be written to ({error.strerror})"
-        raise UserError(f"{run.folder}: {problem}; choose another folder with --out") from error
     old = stages.read_facts(run.path("run.json")).get("stages")
     known = old.items() if isinstance(old, dict) else ()
     return {

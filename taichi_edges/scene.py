@@ -5,7 +5,16 @@
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PlainValidator, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    WrapValidator,
+    field_validator,
+    model_validator,
+)
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0)]
@@ -13,8 +22,10 @@ NotNegative = Annotated[float, Field(ge=0.0)]
 Count = Annotated[int, Field(ge=1)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 Point = Annotated[list[float], Field(min_length=3, max_length=3)]
+Box = Annotated[list[Point], Field(min_length=2, max_length=2)]
 
 
+WITH_POINTS = ("auto", "colmap", "images", "nerfstudio")  # readers of layouts that may hold points of their own
 MOST_BIAS = 20.0  # px; a map that is farther off belongs to another image
 
 
@@ -36,10 +47,20 @@ class OnnxConfig(Section):
 class SourceConfig(Section):
     """Where edge maps and cameras come from."""
 
-    reader: Literal["nerf", "emap", "colmap", "idr", "synthetic"] = Field("emap", description="layout of the folder, see README")
-    path: str = Field("", description="folder, relative to the data root (--data or TAICHI_EDGES_DATA) or absolute")
+    reader: Literal["auto", "colmap", "emap", "idr", "images", "nerf", "nerfstudio", "synthetic"] = Field(
+        "auto", description="layout of the folder, see docs/inputs.md; auto: recognised from what is in it"
+    )
+    path: str = Field(
+        "", description="folder, or the file in it that lists the views; relative to the data root or absolute"
+    )
     edges: str = Field("", description="folder of ready edge maps inside `path`, e.g. edge_DexiNed")
     images: str = Field("", description="folder of the colour images inside `path`; '': where the layout has them")
+    masks: str = Field(
+        "", description="folder of masks inside `path`, 128 and more is kept; '': masks or mask if there is one; none"
+    )
+    max_size: Annotated[int, Field(ge=0)] = Field(
+        1600, description="longest side of photographs, pixels: larger ones are made smaller; 0: keep them"
+    )
     detector: Literal["auto", "maps", "subpixel", "onnx"] = Field(
         "auto", description="ready maps, our own detector, or a network; auto: maps if `edges` is given, else subpixel"
     )
@@ -49,6 +70,9 @@ class SourceConfig(Section):
     onnx: OnnxConfig = Field(default_factory=lambda: OnnxConfig())
     split: str = Field("train", description="nerf: which transforms_<split>.json")
     axes: Literal["auto", "opengl", "opencv"] = Field("auto", description="camera axes; auto: what the layout means")
+    model: str = Field("", description="colmap: folder of the model inside `path`, e.g. sparse/1; '': the largest")
+    max_point_error: Positive = Field(2.0, description="colmap: mean reprojection error of the points used, pixels")
+    min_track: Annotated[int, Field(ge=2)] = Field(3, description="colmap: images that see a point, at least")
     points: str = Field("", description="point cloud to start from with train.seeds: points; relative to the data root")
     thin: bool = Field(True, description="reduce the lines of the edge maps to their ridges and redraw them thin")
     thin_threshold: Share = Field(0.3, description="of full scale; ridges of the edge maps below are dropped")
@@ -131,8 +155,10 @@ class TrainConfig(Section):
         0.0, description="stop when the last two passes lowered the loss by no more than this share each; 0: never"
     )
     gaussians: Count = Field(10_000, description="number of random points to start from")
-    seeds: Literal["random", "points", "votes"] = Field(
-        "random", description="random points in the box, source.points, or where many views agree on an edge"
+    seeds: Literal["auto", "random", "points", "votes"] = Field(
+        "auto",
+        description="random points in the box; points: source.points or the model's; votes: where many views agree on"
+        " an edge; auto: points as far as there are any, else random",
     )
     initial_scale: Positive = Field(0.004, description="standard deviation, unit-cube units")
     initial_opacity: Annotated[float, Field(gt=0, lt=1)] = Field(0.08)
@@ -224,10 +250,43 @@ class RefineConfig(Section):
     )
 
 
-class EvaluationConfig(Section):
-    """Ground truth, where there is one."""
+def _auto_or(value, check):
+    """A union with 'auto' would name the alternatives in its messages, not what is wrong with the list."""
+    return value if value == "auto" else check(value)
 
-    truth: str = Field("", description="ABC folder, PLY or edge JSON, relative to the data root; '': no evaluation")
+
+def _is_held_out(value):
+    names = isinstance(value, list) and value and all(isinstance(name, str) for name in value)
+    return bool(names) or (type(value) is int and value > 0)
+
+
+class ScanConfig(Section):
+    """Which points of a scan are on edges, see evaluation/pseudo_truth.py."""
+
+    edges: str = Field("", description="folder of ready edge maps to judge by, like source.edges; '': the scene's own")
+    threshold: Share = Field(0.5, description="of full scale, that an edge pixel of those maps exceeds")
+    share: Share = Field(0.5, description="of the views that see a point, in more than which it is on an edge")
+    views: Count = Field(3, description="that see a point, at least")
+
+
+class EvaluationConfig(Section):
+    """Ground truth, where there is one, and views that only the evaluation sees."""
+
+    truth: str = Field("", description="ABC folder, PLY or edge JSON, relative to the data root; '': there is none")
+    kind: Literal["edges", "scan"] = Field(
+        "edges",
+        description="what truth holds: edges, or the points of a scanned surface, those on edges being the truth",
+    )
+    scan: ScanConfig = ScanConfig()
+    held_out: Annotated[str | int | list[str], _measured_or(_is_held_out, "a number, or a list of names, of views")] = (
+        Field("auto", description="views kept for the evaluation: their number or names; auto: one in ten, at most 3")
+    )
+
+    @model_validator(mode="after")
+    def _scan_is_there(self):
+        if self.kind == "scan" and not self.truth.lower().endswith(".ply"):
+            raise ValueError("kind is 'scan', so truth must name the PLY with the points of the scan")
+        return self
 
 
 class SceneConfig(Section):
@@ -235,9 +294,10 @@ class SceneConfig(Section):
 
     name: Name = Field("scene", description="folder of the results; the file's name unless set")
     preset: Literal["fast", "paper"] = Field("fast", description="the schedule the scene starts from")
+    scale: Literal["object", "building", "room"] = Field("object", description="settings for scenes of this size")
     seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of every random choice")
-    box: Annotated[list[Point], Field(min_length=2, max_length=2)] = Field(
-        [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], description="opposite corners of the scene, input units"
+    box: Annotated[Box, WrapValidator(_auto_or), PlainSerializer(lambda box: box)] = Field(
+        "auto", description="opposite corners of the scene, input units; auto: the layout's, else the unit cube"
     )
     source: SourceConfig = SourceConfig()
     calibration: CalibrationConfig = CalibrationConfig()
@@ -258,7 +318,7 @@ class SceneConfig(Section):
     @field_validator("box")
     @classmethod
     def _box_has_volume(cls, box):
-        if any(high <= low for low, high in zip(*box)):
+        if box != "auto" and any(high <= low for low, high in zip(*box)):
             raise ValueError("the second corner must be greater than the first in x, y and z")
         return box
 
@@ -266,7 +326,7 @@ class SceneConfig(Section):
     def _source_is_complete(self):
         if self.source.reader != "synthetic" and not self.source.path:
             raise ValueError("source.path is missing; set it to the folder with the images and cameras")
-        if self.train.seeds == "points" and not self.source.points:
+        if self.train.seeds == "points" and not self.source.points and self.source.reader not in WITH_POINTS:
             raise ValueError("train.seeds is 'points', but source.points names no file to take them from")
         if self.source.detector == "onnx" and not self.source.onnx.model:
             raise ValueError("source.detector is 'onnx', but source.onnx.model names no ONNX file")
@@ -282,7 +342,7 @@ PRESETS = {
             "steps": 0,
             "settled": 0.0,
             "gaussians": 10_000,
-            "seeds": "random",
+            "seeds": "auto",
             "initial_scale": 0.004,
             "initial_opacity": 0.08,
             "loss": "balanced",
@@ -335,4 +395,14 @@ PRESETS = {
         "filter": {"refine": True},
         "refine": {"enabled": True},
     },
+}
+
+# What a preset says otherwise for scenes of other sizes, on top of it and below the scene file: SCALES[scale][preset].
+LARGE_IN_THE_PAPER = {  # supplement: "for large scenes" lambda_1 = lambda_2 = 0.01, k = 4 as ever, seeded by SfM points
+    "train": {"seeds": "auto", "orient_weight": 0.01, "shape_weight": 0.01},
+}
+SCALES = {
+    "object": {"paper": {}, "fast": {}},
+    "building": {"paper": LARGE_IN_THE_PAPER, "fast": {}},
+    "room": {"paper": LARGE_IN_THE_PAPER, "fast": {}},
 }

@@ -1,7 +1,7 @@
 """Scene files: one YAML file = one scene.
 
-Unknown and mistyped keys are refused by name. Precedence: defaults < preset < scene file < `--preset` given on the
-command line < `--set key=value`.
+Unknown and mistyped keys are refused by name. Precedence: defaults < preset < scale < scene file < `--preset` and
+`--scale` given on the command line < `--set key=value`. A folder in place of a scene file is a scene without keys.
 """
 
 import difflib
@@ -12,7 +12,9 @@ import yaml
 from pydantic import ValidationError
 
 from taichi_edges.errors import UserError, did_you_mean
-from taichi_edges.scene import PRESETS, SceneConfig, Section
+from taichi_edges.scene import PRESETS, SCALES, SceneConfig, Section
+
+LISTING_SUFFIXES = (".json", ".npz", ".bin", ".txt")  # of files that list the views of a source
 
 
 class _SceneLoader(yaml.SafeLoader):
@@ -74,30 +76,18 @@ def overlay(base, over):
     return merged
 
 
-def load_scene(path, preset=None, settings=(), seed=None):
-    """Read and check a scene file.
+def load_scene(path, preset=None, settings=(), seed=None, scale=None):
+    """Read and check a scene: a YAML file, or a folder of photographs or of a layout that the readers know.
 
-    preset: overrides the scene's preset, and the scene's own values where the preset names them.
+    preset, scale: override the scene's, and the scene's own values where they name them.
     settings: 'key.subkey=value' strings, YAML values. seed: overrides the scene's.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path}: is not a text file; a scene is a YAML file, see scenes/") from error
-    except OSError as error:
-        raise UserError(f"{path}: {_why_unreadable(path, error)}") from error
-    content = parse_yaml(text, path)
-    if not isinstance(content, dict):
-        what = "it is empty" if content is None else f"this is {_in_yaml(content)}"
-        raise UserError(f"{path}: {what}, but a scene is a mapping of keys; see scenes/demo.yaml for an example")
-    content = {"name": path.stem, **content}
-    base = content.get("preset", SceneConfig.model_fields["preset"].default)
-    content = overlay(PRESETS.get(base, {}) if isinstance(base, str) else {}, content)
-    if preset is not None:
-        if preset not in PRESETS:
-            raise UserError(f"--preset {preset}: there is no such preset; there is {', '.join(PRESETS)}")
-        content = overlay(content, {"preset": preset, **PRESETS[preset]})
+    content = _folder_content(path) if is_source(path) else _file_content(path)
+    _refuse_unknown("preset", preset, PRESETS)
+    _refuse_unknown("scale", scale, SCALES)
+    content = overlay(_starting_values(content.get("preset"), scale or content.get("scale")), content)
+    content = _overridden(content, preset, scale)
     origins = {}
     for setting in settings:
         keys, value = _parse_setting(setting)
@@ -111,11 +101,64 @@ def load_scene(path, preset=None, settings=(), seed=None):
     return check_scene(content, path, origins)
 
 
+def is_source(path):
+    """Whether what was given in place of a scene file is the source itself: a folder, or a file that lists views."""
+    return path.is_dir() or (path.suffix.lower() in LISTING_SUFFIXES and path.is_file())
+
+
+def _folder_content(path):
+    """The scene that a folder without a scene file is: its own path and name, everything else as by default."""
+    from taichi_edges.readers.recognition import scene_name
+
+    return {"name": scene_name(path), "source": {"reader": "auto", "path": str(path.resolve())}}
+
+
+def _file_content(path):
+    """What a scene file says, with the file's name where it names no scene."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        what = "a scene is a YAML file, see scenes/, or a folder of photographs"
+        raise UserError(f"{path}: is not a text file; {what}") from error
+    except OSError as error:
+        raise UserError(f"{path}: {_why_unreadable(path, error)}") from error
+    content = parse_yaml(text, path)
+    if not isinstance(content, dict):
+        what = "it is empty" if content is None else f"this is {_in_yaml(content)}"
+        raise UserError(f"{path}: {what}, but a scene is a mapping of keys; see scenes/demo.yaml for an example")
+    return {"name": path.stem, **content}
+
+
+def _starting_values(preset, scale):
+    """What a scene starts from: its preset, and over it what the preset says for scenes of this scale."""
+    preset = SceneConfig.model_fields["preset"].default if preset is None else preset
+    scale = SceneConfig.model_fields["scale"].default if scale is None else scale
+    if not (isinstance(preset, str) and preset in PRESETS):
+        return {}  # refused below, as every value of a wrong type
+    of_scale = SCALES.get(scale, {}) if isinstance(scale, str) else {}
+    return overlay(PRESETS[preset], of_scale.get(preset, {}))
+
+
+def _refuse_unknown(option, value, known):
+    if value is not None and value not in known:
+        raise UserError(f"--{option} {value}: there is no such {option}; there is {', '.join(known)}")
+
+
+def _overridden(content, preset, scale):
+    """The scene with the preset and the scale of the command line, where there are any, over its own values."""
+    of_scale = scale or content.get("scale")
+    if preset is not None:
+        content = overlay(content, {"preset": preset, **_starting_values(preset, of_scale)})
+    if scale is not None:
+        preset = content.get("preset", SceneConfig.model_fields["preset"].default)
+        values = SCALES[scale].get(preset, {}) if isinstance(preset, str) else {}
+        content = overlay(content, {"scale": scale, **values})
+    return content
+
+
 def _why_unreadable(path, error):
     """What is wrong with a scene's path; a scene of a similar name in the same folder is named."""
     elsewhere = "; the scenes that come along are in scenes/"
-    if path.is_dir():
-        return f"is a folder, not a scene file{elsewhere}"
     near = did_you_mean(path.name, [p.name for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else [])
     return f"{error.strerror}{near or elsewhere}"
 
@@ -126,8 +169,9 @@ def _parse_setting(setting):
     keys = tuple(key.strip().split("."))
     if not equals or not all(keys):
         raise UserError(f"--set {setting}: write key=value, e.g. --set train.epochs=100")
-    if keys == ("preset",):
-        raise UserError(f"--set {setting}: a preset brings many values with it; use --preset{value and ' '}{value}")
+    if keys in (("preset",), ("scale",)):
+        option = keys[0]
+        raise UserError(f"--set {setting}: a {option} brings many values with it; use --{option}{value and ' '}{value}")
     return keys, parse_yaml(value, f"--set {key.strip()}")
 
 

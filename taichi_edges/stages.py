@@ -9,6 +9,7 @@ stage that needs it: a run that is up to date, and a mistake in the scene file, 
 import csv
 import io
 import json
+import os
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -24,40 +25,123 @@ from taichi_edges.views import read_views, write_views
 from taichi_edges.wireframe import read_wireframe, write_wireframe
 
 WIDEST_PX = 40.0  # of a detector's lines
+UNIT_CUBE = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+WRONG_CAMERAS = "poses or intrinsics may not be those of these images (their order, axes or scale)"
 CALIBRATION_SEEDS = 4000  # 3D points through which a detector's biases are measured, at most
 
 
 def prepare(run):
-    """Source -> `views.npz` and `detection.png`; of synthetic scenes also `truth.json` and pictures in `images/`."""
+    """Source -> `views.npz`, `held_out.npz` (views for the evaluation alone) and `detection.png`.
+
+    Of synthetic scenes also `truth.json` and pictures in `images/`.
+    """
     if run.config.source.reader == "synthetic":
         return _prepare_synthetic(run)
     from taichi_edges.detectors import DETECTORS, choose_detector
-    from taichi_edges.readers import READERS
     from taichi_edges.readers.frames import build_views, camera_poses, chosen_frames
 
     source = run.config.source
-    frames = chosen_frames(READERS[source.reader](run.data_path(source.path, "source.path"), source), source.skip)
-    if any(frames.lenses):
-        from taichi_edges.readers.undistortion import undistorted_frames
-
-        frames = undistorted_frames(frames, run.path("undistorted"))
+    frames = _posed_frames(run, chosen_frames(_listed_frames(run), source.skip))
+    _pass_on(frames, run.progress)
     camera_poses(frames)  # a mistake in them shall not wait for the detector
+    box, box_from = _scene_box(run, frames)
+    _refuse_missing_points(run, frames)
+    frames = _checked(run, frames, box, guessed=box_from == "reader")
     detector = choose_detector(source, frames)
     _refuse_needless_calibration(run, detector)
+    frames = _undistorted(run, frames)
     frames, edge_maps, edgels = DETECTORS[detector](frames, run)
-    box = run.config.box if frames.box is None else frames.box
-    if any(frames.mask_paths):
-        from taichi_edges.detectors.drawing import draw_edge_maps
-        from taichi_edges.detectors.masks import within_masks
-        from taichi_edges.detectors.ridges import trace_ridges
+    views = _inside_the_run(run, build_views(frames, edge_maps, edgels, source, box, run.progress))
+    facts = {"detector": detector, "box": np.array(box).tolist(), "box_from": box_from}
+    facts |= _finish_views(run, views, frames)
+    own = [path for path in views.image_paths if path and not Path(path).is_absolute()]
+    return {**facts, "files": [*own, *facts["files"], *_write_points(run, frames, box)]}
 
-        height, width = edge_maps.shape[1:]
-        if edgels is None:
-            edgels = trace_ridges(edge_maps, 4.0, source.thin_threshold, run.threads)
-        edgels = within_masks(edgels, frames.mask_paths, (width, height))
-        edge_maps = draw_edge_maps(edgels, height, width, run.threads)
-    views = build_views(frames, edge_maps, edgels, source, box, run.progress)
-    return {"detector": detector, **_finish_views(run, views)}
+
+def _listed_frames(run, **changed):
+    """What the reader found. changed: keys of the scene's source that are to be read otherwise."""
+    from taichi_edges.readers import READERS
+
+    source = run.config.source.model_copy(update=changed)
+    return READERS[source.reader](run.data_path(source.path, "source.path"), source)
+
+
+def _posed_frames(run, frames):
+    """The frames themselves; photographs without poses after structure from motion."""
+    source = run.config.source
+    if source.reader != "images":
+        return frames
+    from taichi_edges.readers.photos import posed_photos
+
+    folder = run.data_path(source.path, "source.path")
+    return posed_photos(frames, folder, source, run.path("sfm"), run.config.seed, run.threads, run.progress)
+
+
+def _pass_on(frames, progress):
+    """Tell the user what the reader has to say."""
+    for note in frames.notes:
+        progress.say(note)
+    for warning in frames.warnings:
+        progress.warn(warning)
+
+
+def _scene_box(run, frames):
+    """(2, 3) corners of the scene, input units, and where they are from."""
+    if run.config.box != "auto":
+        return run.config.box, "scene"
+    if frames.box is not None:
+        corners = " to ".join("(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in frames.box)
+        run.progress.say(
+            f"scene box {corners}, in units of the cameras, as the layout has it; the key box sets another"
+        )
+        return frames.box, "reader"
+    if frames.points is not None:
+        found = f"{len(frames.points)} points fit well enough to tell where the scene is"
+        raise UserError(f"{frames.where}: only {found}; set box, or raise source.max_point_error")
+    return UNIT_CUBE, "unit cube"
+
+
+def _checked(run, frames, box, guessed):
+    """The frames, whose cameras and box can be those of one scene; without those that do not see a guessed box."""
+    from taichi_edges.readers.frames import check_before_detection, frames_in_sight
+    from taichi_edges.readers.images import refuse_copies
+
+    source = run.config.source
+    if guessed:
+        frames = frames_in_sight(frames, source, box, run.progress)
+    check_before_detection(frames, source, box)
+    refuse_copies(frames, run.progress)
+    return frames
+
+
+def _undistorted(run, frames):
+    """The frames as pinhole cameras would have taken them, their pictures in the run's folder."""
+    from taichi_edges.readers.undistortion import undistorted_frames
+
+    source, folder = run.config.source, run.path("undistorted")
+    return undistorted_frames(frames, folder, source.max_size, source.gamma, run.threads, run.progress)
+
+
+def _refuse_missing_points(run, frames):
+    """UserError where the training is to start from points and there are none."""
+    if run.config.train.seeds == "points" and not run.config.source.points and not _has_points(frames):
+        problem = "train.seeds is 'points', but the model has none that fit"
+        raise UserError(f"{frames.where}: {problem}; set source.points or another train.seeds")
+
+
+def _has_points(frames):
+    return frames.points is not None and len(frames.points) > 0
+
+
+def _inside_the_run(run, views):
+    """The views with paths relative to the run's folder for pictures in it: it may be moved."""
+    folder = str(run.folder)
+    paths = (os.path.relpath(path, folder) if path and _lies_in(path, folder) else path for path in views.image_paths)
+    return replace(views, image_paths=tuple(paths))
+
+
+def _lies_in(path, folder):
+    return os.path.commonpath([os.path.abspath(path), os.path.abspath(folder)]) == os.path.abspath(folder)
 
 
 def _refuse_needless_calibration(run, detector):
@@ -68,20 +152,51 @@ def _refuse_needless_calibration(run, detector):
         raise UserError(f"{problem}; leave it out, or name ready maps in source.edges")
 
 
-def _finish_views(run, views):
-    """Trace and calibrate the edgels where the detector gave maps, write `views.npz` and the report; the facts."""
-    facts = {"views": len(views), "width_px": views.width, "height_px": views.height}
-    residuals = {}
-    if views.edgels is None:
+def _finish_views(run, views, frames=None):
+    """Trace and calibrate the edgels where the detector gave maps, write the views and the report; the facts.
+
+    frames: whose masks drop edgels; None where there are none.
+    """
+    from taichi_edges.evaluation.held_out import choose_held_out, split_views
+
+    facts, residuals = {"width_px": views.width, "height_px": views.height}, {}
+    traced_here = views.edgels is None
+    if traced_here:
         views, width = _traced(run, views)
         facts["line_width_px"] = round(width, 2)
+    if frames is not None:
+        views, dropped = _masked(run, views, frames, redraw=not traced_here)
+        facts |= {} if dropped is None else {"masked_edgels": dropped}
+    views, held_out = split_views(views, choose_held_out(views.names, run.config.evaluation.held_out))
+    facts = {"views": len(views), "held_out": list(held_out.names), **facts}
+    if traced_here:
         views, calibration = _calibrated(run, views)
+        held_out = _corrected(run, held_out, calibration)
         if calibration is not None:
             facts["calibration"] = calibration.facts()
             residuals = {"residuals": calibration.residuals, "on_silhouette": calibration.on_silhouette}
     facts["edgels"] = len(views.edgels)
     write_views(run.path("views.npz"), views)
-    return {**facts, "files": [_write_sheet(run, views, residuals), *_copy_points(run)]}
+    write_views(run.path("held_out.npz"), held_out)
+    return {**facts, "files": [_write_sheet(run, views, residuals)]}
+
+
+def _masked(run, views, frames, redraw):
+    """The views without the edgels that their masks drop, and how many those are; None without masks.
+
+    redraw: the maps are drawn through the edgels; else they are black where masks are, and drawn anew later, or not.
+    """
+    from taichi_edges.detectors.drawing import draw_edge_maps
+    from taichi_edges.detectors.masks import blank_outside, has_areas, within_masks
+
+    if not has_areas(frames):
+        return views, None
+    kept = within_masks(views.edgels, frames, (views.width, views.height), run.progress)
+    if redraw:
+        maps = draw_edge_maps(kept, views.height, views.width, run.threads)
+    else:
+        maps = blank_outside(views.edge_maps, frames)
+    return replace(views, edgels=kept, edge_maps=maps), len(views.edgels) - len(kept)
 
 
 def _detected_in_pictures(run, views):
@@ -156,6 +271,22 @@ def _calibrate(run, views, thin):
     )
 
 
+def _corrected(run, views, calibration):
+    """Held-out views, their edgels without the biases that the Calibration, None for none, has found in the others."""
+    from taichi_edges.detectors.calibration import sides_of
+    from taichi_edges.detectors.drawing import draw_edge_maps
+
+    edgels = views.edgels
+    if not len(views):
+        return views
+    if calibration is not None and len(edgels):
+        silhouette = calibration.silhouette_applied * calibration.silhouette
+        values = np.array([silhouette, *(calibration.shift_applied * calibration.shift)])
+        edgels = sides_of(with_whole_paths(run, views), edgels, run.threads).correct(edgels, values)[0]
+    maps = draw_edge_maps(edgels, views.height, views.width, run.threads) if run.config.source.thin else views.edge_maps
+    return replace(views, edgels=edgels, edge_maps=maps)
+
+
 def _write_sheet(run, views, residuals):
     """The picture of what the detector gave; its name."""
     from taichi_edges.exporters.detection_sheet import write_detection_sheet
@@ -164,15 +295,21 @@ def _write_sheet(run, views, residuals):
     return "detection.png"
 
 
-def _copy_points(run):
-    """The points the scene names, those inside the box, to `seeds.ply`. Returns the names of the files written."""
-    if not run.config.source.points:
+def _write_points(run, frames, box):
+    """The points the scene or the layout has, those inside the box, to `seeds.ply`. Returns the files written.
+
+    box: (2, 3) corners, input units.
+    """
+    from taichi_edges.exporters.ply import write_float_vertices
+    from taichi_edges.readers.points import inside_box, read_points
+
+    if run.config.source.points:
+        points = read_points(run.data_path(run.config.source.points, "source.points"), box)
+    else:
+        points = inside_box(frames.points, box) if frames is not None and _has_points(frames) else []
+    if len(points) == 0:
         run.path("seeds.ply").unlink(missing_ok=True)  # of an older run with other settings
         return []
-    from taichi_edges.exporters.ply import write_float_vertices
-    from taichi_edges.readers.points import read_points
-
-    points = read_points(run.data_path(run.config.source.points, "source.points"), run.config.box)
     write_float_vertices(run.path("seeds.ply"), ("x", "y", "z"), points)
     return ["seeds.ply"]
 
@@ -204,7 +341,8 @@ def _prepare_synthetic(run):
         views = _detected_in_pictures(run, views)
     write_edges(run.path("truth.json"), part.edges, {"part": part.name})
     facts = _finish_views(run, views)
-    return {"part": part.name, **facts, "files": ["truth.json", *files, *facts["files"]]}
+    points = _write_points(run, None, UNIT_CUBE)
+    return {"part": part.name, **facts, "files": ["truth.json", *files, *facts["files"], *points]}
 
 
 def train(run):
@@ -246,20 +384,24 @@ def _start(run, views, generator):
         voted = voted_gaussians(views, config.edge_threshold, config.gaussians, config.initial_opacity, generator)
         if voted is not None:
             return voted
-        seeds, instead = ("points", "source.points") if run.config.source.points else ("random", "random points")
+        seeds = "points" if run.path("seeds.ply").is_file() else "random"
+        instead = {"points": "the given points", "random": "random points"}[seeds]
         found = f"the views agree on an edge in fewer than {LEAST_VOTED} places"
-        run.progress.warn(f"{found}; the training starts from {instead} instead")
-    if seeds == "points":
+        run.progress.warn(f"{found}: {WRONG_CAMERAS}; the training starts from {instead} instead")
+    if seeds == "random" or not run.path("seeds.ply").is_file():
+        points = random_points(config.gaussians, views.box, generator)
+    else:
         given = stack_fields(read_vertices(run.path("seeds.ply"), ("x", "y", "z")), ("x", "y", "z"))
         points = given_points(views.similarity.to_unit(given.astype(np.float64)), config.gaussians, generator)
-    else:
-        points = random_points(config.gaussians, views.box, generator)
+        if seeds == "auto":  # structure from motion finds few points where there is no texture
+            more = random_points(config.gaussians - len(points), views.box, generator)
+            points = np.concatenate([points, more])
     return start_gaussians(points, generator, config.initial_scale, config.initial_opacity)
 
 
 def seed_files(run):
-    """The points that training starts from, where the scene names some."""
-    return [run.path("seeds.ply")] if run.config.source.points else []
+    """The points that training may start from, where the scene or the layout has some."""
+    return [run.path("seeds.ply")]
 
 
 def _write_csv(path, rows):
@@ -360,24 +502,81 @@ def truth_path(run):
 def evaluate(run):
     """`edges.json` -> `metrics.json` and `metrics.csv`: EMAP's protocol, corners, free ends; without a truth fewer.
 
-    Lengths are in the frame of the truth, in the unit cube where there is none.
+    And what the held-out views say. Lengths are in the frame of the truth, in the unit cube where there is none. With a
+    scan for a truth also `pseudo_truth.ply`, its points on edges (input frame).
     """
-    from taichi_edges.evaluation.ground_truth import read_ground_truth
+    from taichi_edges.evaluation.held_out import held_out_metrics
     from taichi_edges.evaluation.metrics import evaluate as measure
-    from taichi_edges.evaluation.metrics import measure_alone
+    from taichi_edges.evaluation.metrics import exact_polylines, measure_alone
 
     edges, _ = read_edges(run.path("edges.json"))
-    views, path = read_views(run.path("views.npz")), truth_path(run)
-    if path is None:
-        metrics = {**measure_alone(edges.transformed(views.similarity.to_unit)), "ground_truth": None}
+    views, held_out = read_views(run.path("views.npz")), read_views(run.path("held_out.npz"))
+    unit, truth = edges.transformed(views.similarity.to_unit), _ground_truth(run, views, held_out)
+    if truth is None:
+        metrics = measure_alone(unit)
     else:
-        to_truth, from_truth = views.input_to_truth, np.linalg.inv(views.input_to_truth)
-        truth = read_ground_truth(path, lambda points: views.similarity.to_unit(transform(from_truth, points)))
-        into_frame = partial(transform, to_truth) if truth.own_frame else views.similarity.to_unit
-        metrics = {**measure(edges.transformed(into_frame), truth), "ground_truth": truth.source}
+        metrics = measure(
+            edges.transformed(partial(transform, views.input_to_truth)) if truth.own_frame else unit, truth
+        )
+    metrics |= held_out_metrics(exact_polylines(unit), views, held_out)
+    metrics["ground_truth"] = truth and truth.source
     write_json(run.path("metrics.json"), metrics)
     _write_csv(run.path("metrics.csv"), [("metric", "value"), *metrics.items()])
-    return metrics
+    return {**metrics, "files": _write_pseudo_truth(run, views, truth)}
+
+
+def _ground_truth(run, views, held_out):
+    """The GroundTruth of the scene, or None. views, held_out: Views that found its edges, and the others."""
+    from taichi_edges.evaluation.ground_truth import read_ground_truth, read_sampled_ply
+    from taichi_edges.evaluation.projected_curves import Camera
+    from taichi_edges.evaluation.pseudo_truth import Votes, points_in_box, pseudo_truth
+
+    path, config, from_truth = truth_path(run), run.config.evaluation, np.linalg.inv(views.input_to_truth)
+
+    def to_unit(points):
+        return views.similarity.to_unit(transform(from_truth, points))
+
+    if path is None or config.kind != "scan":
+        return read_ground_truth(path, to_unit) if path else None
+    points = points_in_box(read_sampled_ply(path, to_unit).points, views.box, str(path))
+    cameras = {some.names[view]: Camera.of(some, view) for some in (views, held_out) for view in range(len(some))}
+    maps = _scan_maps(run, views, held_out)
+    with run.progress.track("scan", len(maps)) as report:
+        votes = Votes.of(points, [cameras[name] for name in maps], maps.values(), config.scan.threshold, report)
+    return pseudo_truth(points, votes, config.scan, str(path))
+
+
+def _scan_maps(run, views, held_out):
+    """{name of a view: (H, W) uint8 edge map} that a scan's points are projected on."""
+    folder, source = run.config.evaluation.scan.edges, run.config.source
+    names = [*views.names, *held_out.names]
+    if not folder:
+        return dict(zip(names, [*views.edge_maps, *held_out.edge_maps], strict=True))
+    if source.reader == "synthetic":
+        raise UserError("evaluation.scan.edges: a synthetic scene has no folders of maps; leave it out")
+    from taichi_edges.readers.frames import chosen_frames
+    from taichi_edges.readers.images import read_edge_maps
+    from taichi_edges.readers.undistortion import undistorted_frames
+
+    frames, made = chosen_frames(_listed_frames(run, edges=folder), source.skip), run.path("undistorted_for_scan")
+    frames = undistorted_frames(frames, made, source.max_size, source.gamma, run.threads, run.progress)
+    maps = dict(zip(frames.names, read_edge_maps(frames, run.progress, run.threads), strict=True))
+    if next(iter(maps.values())).shape != views.edge_maps.shape[1:]:
+        problem = f"its maps are not {views.width} x {views.height} px as the scene's views are"
+        raise UserError(f"evaluation.scan.edges: {folder}: {problem}; write them in that size")
+    return {name: maps[name] for name in names}
+
+
+def _write_pseudo_truth(run, views, truth):
+    """The names of the files written: the points of the GroundTruth, if they are those of a scan on edges."""
+    path = run.path("pseudo_truth.ply")
+    if run.config.evaluation.kind != "scan":
+        path.unlink(missing_ok=True)  # of an older run with other settings
+        return []
+    from taichi_edges.exporters.ply import write_float_vertices
+
+    write_float_vertices(path, ("x", "y", "z"), views.similarity.to_input(truth.points))
+    return [path.name]
 
 
 def export(run):
@@ -408,10 +607,7 @@ def picture_files(run):
     source = run.config.source
     if source.reader == "synthetic":
         return []
-    from taichi_edges.readers import READERS
-
-    frames = READERS[source.reader](run.data_path(source.path, "source.path"), source)
-    return [Path(path) for path in frames.image_paths if Path(path).is_file()]
+    return [Path(path) for path in _listed_frames(run).image_paths if path and Path(path).is_file()]
 
 
 def source_files(run):
@@ -421,11 +617,10 @@ def source_files(run):
     models = [_model_file(run)] if source.detector == "onnx" else []
     if source.reader == "synthetic":
         return [*points, *models]
-    from taichi_edges.readers import READERS
-
-    frames = READERS[source.reader](run.data_path(source.path, "source.path"), source)
-    paths = [Path(path) for path in (*frames.edge_paths, *frames.image_paths) if path]
-    return [frames.where, *sorted({path for path in paths if path.is_file()}), *points, *models]
+    frames = _listed_frames(run)
+    paths = {Path(path) for path in (*frames.edge_paths, *frames.image_paths, *frames.mask_paths) if path}
+    own = dict.fromkeys(path for path in (frames.where, *frames.files) if path.is_file())
+    return [*own, *sorted(path for path in paths if path.is_file()), *points, *models]
 
 
 def _model_file(run):
@@ -445,7 +640,17 @@ def truth_files(run):
         return []
     if run.config.evaluation.truth:  # that of a synthetic scene may still have to be written
         refuse_unknown(path)
-    return sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [Path(path)]
+    truth = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [Path(path)]
+    return truth + _scan_map_files(run)
+
+
+def _scan_map_files(run):
+    """The edge maps that the points of a scan are held against, where the scene names a folder of its own for them."""
+    source, config = run.config.source, run.config.evaluation
+    if config.kind != "scan" or not config.scan.edges or source.reader == "synthetic":
+        return []
+    frames = _listed_frames(run, edges=config.scan.edges)
+    return [Path(path) for path in frames.edge_paths if path and Path(path).is_file()]
 
 
 def read_facts(path):

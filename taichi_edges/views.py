@@ -95,7 +95,7 @@ def read_views(path):
     return _views_of(os.fspath(path), file_state(path))
 
 
-@functools.lru_cache(maxsize=1)
+@functools.lru_cache(maxsize=2)  # the views that edges are made from, and those held out
 def _views_of(path, _state):
     with np.load(path) as archive:
         views = Views(

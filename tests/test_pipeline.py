@@ -28,6 +28,7 @@ from taichi_edges.command import print_summary
 from taichi_edges.edge_set import EdgeSet, read_edges, write_edges
 from taichi_edges.edges.refinement import RefineCounts
 from taichi_edges.errors import UserError
+from taichi_edges.evaluation.held_out import split_views
 from taichi_edges.exporters.point_cloud import read_oriented_points
 from taichi_edges.exporters.splats import read_gaussians
 from taichi_edges.findings import FINDINGS
@@ -43,6 +44,7 @@ from taichi_edges.wireframe import read_wireframe
 ROOT = Path(__file__).parent.parent
 ARTEFACTS = (
     "views.npz",
+    "held_out.npz",
     "gaussians.ply",
     "train_log.csv",
     "points.ply",
@@ -205,13 +207,19 @@ def states(ran, skipped):
 # -------------------------------------------------------------------------------------------------- units and frames
 
 
+def write_both_views(folder, views):
+    """What the prepare stage writes where no view is held out."""
+    for name, some in zip(("views.npz", "held_out.npz"), split_views(views, []), strict=True):
+        write_views(folder / name, some)
+
+
 def test_metrics_do_not_depend_on_the_units_of_the_input(tmp_path):
     """One "mm" is 0.001 of the unit cube: edges 4 input units beside the truth in a box of 2000 are 2 mm off."""
     box = [[-1000.0, -1000, -1000], [1000, 1000, 1000]]
     views = Views(
         ("a",), np.zeros((1, 8, 8), np.uint8), np.eye(3)[None], np.eye(4)[None, :3], ("",), Similarity.of_box(box)
     )
-    write_views(tmp_path / "views.npz", views)
+    write_both_views(tmp_path, views)
     ends = np.array([[[-800.0, 0, 0], [800, 0, 0]]])
     write_edges(tmp_path / "truth_in_input_units.json", EdgeSet.of(ends), {})
     write_edges(tmp_path / "edges.json", EdgeSet.of(ends + [0, 4, 0]), {})
@@ -226,7 +234,7 @@ def test_without_a_truth_the_edges_are_measured_alone(tmp_path, capsys):
     """In the unit cube, whatever the units of the input."""
     similarity, pose = Similarity(1.0 / 800.0, (0.1, 0.2, 0.3)), np.eye(3, 4)[None]
     views = Views(("v",), np.zeros((1, 4, 4), np.uint8), np.eye(3)[None], pose, ("",), similarity)
-    write_views(tmp_path / "views.npz", views)
+    write_both_views(tmp_path, views)
     lines = similarity.to_input([[[0.1, 0.2, 0.3], [0.9, 0.2, 0.3]], [[0.9, 0.2, 0.3], [0.9, 0.5, 0.3]]])
     write_edges(tmp_path / "edges.json", EdgeSet.of(lines), {"units": "input"})
     run = Run(check_scene({"source": {"reader": "nerf", "path": "unused"}}, "test"), tmp_path)
@@ -296,12 +304,16 @@ def test_all_artefacts_are_there_and_can_be_read(finished):
     folder = runs / "tiny"
     assert {name for name in ARTEFACTS if not (folder / name).is_file()} == set()
     assert len(list((folder / "overlays").glob("*.png"))) == 4 and len(list((folder / "images").glob("*.png"))) == 12
-    assert len(read_views(folder / "views.npz")) == 12
+    views, held_out = read_views(folder / "views.npz"), read_views(folder / "held_out.npz")
+    assert len(views) == 11 and len(held_out) == 1 and not set(views.names) & set(held_out.names)
     edges, about = read_edges(folder / "edges.json")
     assert len(edges) > 0 and about["frame"] == "input" and about["seed"] == 0
     assert (folder / "gaussians.ply").read_bytes().startswith(b"ply\n")
     log = list(csv.DictReader((folder / "train_log.csv").open()))
-    assert [int(row["step"]) for row in log] == [*range(50, 480, 50), 480]
+    assert [int(row["step"]) for row in log] == [
+        *range(50, 440, 50),
+        440,
+    ]  # 40 epochs of the 11 views that are not held out
     assert left_behind(folder) == []
 
 
@@ -337,7 +349,7 @@ def test_output_is_a_summary_and_the_progress_goes_to_standard_error(finished):
     lines = done.stderr.splitlines()
     assert lines[0] == "prepare ..." and lines[-1].startswith(f"export: {exported} and 4 pictures")
     assert any(
-        re.fullmatch(r"train: \d+ Gaussians after 480 view steps, final loss 0\.\d{4} \(.* s\)", line) for line in lines
+        re.fullmatch(r"train: \d+ Gaussians after 440 view steps, final loss 0\.\d{4} \(.* s\)", line) for line in lines
     )
 
 
@@ -347,6 +359,9 @@ def test_every_stage_can_say_what_it_found():
     assert FINDINGS["fit"](fit) == "1 line and 2 curves (1 closed edge); left out: 3 clusters that are too short"
     alone = {"edges": 2, "predicted_length_units": 1.5, "free_ends": 1, "ground_truth": None}
     assert FINDINGS["evaluate"](alone) == "2 edges, 1.50 units long, 1 free end; there is no ground truth"
+    seen = {"held_out_views": 3, "held_out_precision_percent": 93.14, "held_out_recall_long_percent": 62.4}
+    found = "; 3 views held out: precision 93.1 %, recall 62.4 % of long edges"
+    assert FINDINGS["evaluate"](alone | seen).endswith(f"there is no ground truth{found}")
     refined = {"edges": 1, "vertices": 2, **asdict(RefineCounts(duplicates=1, unsupported=2))}
     left_out = "left out: 1 duplicate, 2 edges without support in the images"
     assert FINDINGS["refine"](refined) == f"1 edge, 2 vertices; {left_out}"
@@ -771,3 +786,44 @@ def test_temporary_files_of_the_dead_are_removed_and_those_of_the_living_stay(tm
         assert {path.name for path in tmp_path.iterdir()} == {names[1], "views.npz"}
     finally:
         living.communicate(b"\n")
+
+
+# --------------------------------------------------------------------------------------------------- two runs at once
+
+HOLDER = """
+import sys
+from pathlib import Path
+from taichi_edges.artefacts import locked
+
+with locked(Path(sys.argv[1])):
+    print("locked", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def holder(copied):
+    """A process that holds the lock of the copied run, as another run would."""
+    arguments = [sys.executable, "-c", HOLDER, str(copied[2])]
+    with subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        assert process.stdout.readline() == "locked\n"
+        yield process
+        process.kill()
+
+
+def test_a_second_run_into_the_same_folder_is_refused(copied, holder):
+    message = refused(copied)
+    assert f"another run, process {holder.pid}, is writing into this folder; wait for it" in message
+
+
+def test_the_lock_of_a_dead_run_is_taken_over(copied, holder):
+    holder.kill()
+    holder.wait()
+    _, said = rerun(copied)
+    assert said.states() == states([], STAGES)
+
+
+def test_show_without_a_display_is_refused_before_anything_is_done(tmp_path):
+    message = refuse(command("scenes/demo.yaml", tmp_path, "--show"), DISPLAY="", WAYLAND_DISPLAY="")
+    assert "there is no display" in message
+    assert list(tmp_path.iterdir()) == []

@@ -147,19 +147,26 @@ def test_opengl_axes_look_along_minus_z(nerf):
     """Written out by hand: a camera at z = 3 that looks down on the cube, x to the right, y up."""
     lens = [[64.0, 0, 31.5], [0, 64.0, 31.5], [0, 0, 1]]
     pose = [[1.0, 0, 0, 0.5], [0, 1, 0, 0.5], [0, 0, 1, 3], [0, 0, 0, 1]]
-    for frame in nerf.content["frames"]:
-        frame.update(camera_intrinsics=lens, transform_matrix=pose)
+    nerf.content["frames"][0].update(camera_intrinsics=lens, transform_matrix=pose)
     pixels, depths = nerf.read().project(np.array([[0.5, 0.5, 1.0], [0.75, 0.5, 1], [0.5, 0.75, 1]]), 0)
     np.testing.assert_allclose(pixels, [[31.5, 31.5], [39.5, 31.5], [31.5, 23.5]])  # 0.25 right: +8 px; 0.25 up: -8 px
     np.testing.assert_allclose(depths, 2.0)
+
+
+def test_a_listing_can_be_named_in_place_of_its_folder(folder):
+    expected = folder.read()
+    other = folder.listing.rename(folder.path / "other.json")
+    config = SourceConfig(reader=folder.kind, path="unused", **({"edges": "edge"} if folder.kind == "emap" else {}))
+    views = views_of_maps(READERS[folder.kind](other, config), config, UNIT_BOX, folder.warnings)
+    assert views.names == expected.names
+    np.testing.assert_array_equal(views.world_to_camera, expected.world_to_camera)
 
 
 def test_opencv_axes_look_along_z(emap):
     """Written out by hand: a camera at z = -2 that looks up at the cube from below, x to the right, y down."""
     lens = [[64.0, 0, 31.5], [0, 64.0, 31.5], [0, 0, 1]]
     pose = [[1.0, 0, 0, 0.5], [0, 1, 0, 0.5], [0, 0, 1, -2], [0, 0, 0, 1]]
-    for frame in emap.content["frames"]:
-        frame.update(intrinsics=lens, camtoworld=pose)
+    emap.content["frames"][0].update(intrinsics=lens, camtoworld=pose)
     pixels, depths = emap.read().project(np.array([[0.5, 0.5, 0.0], [0.75, 0.5, 0], [0.5, 0.75, 0]]), 0)
     np.testing.assert_allclose(pixels, [[31.5, 31.5], [39.5, 31.5], [31.5, 39.5]])
     np.testing.assert_allclose(depths, 2.0)
@@ -228,6 +235,47 @@ def test_skip_leaves_views_out_with_all_their_mistakes(folder, block):
     assert views.names == ("v0", "v2", "v3")
     np.testing.assert_allclose(views.intrinsics, block[0][[0, 2, 3]])
     np.testing.assert_array_equal(views.edge_maps, block[2][[0, 2, 3]])
+
+
+def test_the_box_of_an_emap_folder_is_its_own(emap, block):
+    read = READERS["emap"]
+
+    def box():
+        emap.listing.write_text(json.dumps(emap.content))
+        return read(emap.path, SourceConfig(reader="emap", path="unused", edges="edge")).box
+
+    assert box() is None
+    emap.content["scene_box"] = {"aabb": [[-1, -1, -1], [1, 1, 1]], "near": 0.05, "far": 2.5}
+    np.testing.assert_array_equal(box(), [[-1, -1, -1], [1, 1, 1]])
+    for wrong in ([[1, 1, 1], [-1, -1, -1]], [[0, 0], [1, 1]], "box"):
+        emap.content["scene_box"] = {"aabb": wrong}
+        with pytest.raises(UserError, match="scene_box.aabb"):
+            box()
+
+
+def test_replica_has_jpeg_images_and_png_edge_maps(tmp_path, block):
+    """EMAP's Replica_Edge: frames of 1200 x 680 px, 4x4 intrinsics, PiDiNet's maps beside JPEG images, worldtogt."""
+    folder = Folder(tmp_path / "room0", "emap", block)
+    shutil.rmtree(folder.path / "edge")
+    for name, suffix in (("color", "jpg"), ("edge_PidiNet", "png"), ("edge_DexiNed", "jpg")):
+        (folder.path / name).mkdir()
+        for view in range(VIEWS):
+            grey = np.zeros((680, 1200), np.uint8)
+            grey[300:303] = 255
+            cv2.imwrite(str(folder.path / name / f"frame{view:06d}.{suffix}"), grey)
+    for view, frame in enumerate(folder.content["frames"]):
+        lens = np.eye(4)
+        lens[:3, :3] = [[600, 0, 599.5], [0, 600, 339.5], [0, 0, 1]]
+        frame |= {"rgb_path": f"frame{view:06d}.jpg", "intrinsics": lens.tolist()}
+    to_truth = np.diag([3.5, 3.5, 3.5, 1.0])
+    box = {"aabb": [[-1, -1, -1], [1, 1, 1]], "near": 0.05, "far": 2.5, "radius": 1.0}
+    folder.content |= {"width": 1200, "height": 680, "worldtogt": to_truth.tolist(), "scene_box": box}
+    for edges in ("edge_PidiNet", "edge_DexiNed"):
+        views = folder.read(edges=edges)
+        assert (views.width, views.height, views.names[0]) == (1200, 680, "frame000000")
+        assert [Path(path).name for path in views.image_paths][:2] == ["frame000000.jpg", "frame000001.jpg"]
+        np.testing.assert_array_equal(views.input_to_truth, to_truth)
+    assert folder.warnings.texts == []
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,8 @@ import pytest
 import yaml
 
 from taichi_edges.errors import UserError
-from taichi_edges.scene import PRESETS, SceneConfig
-from taichi_edges.scene_file import load_scene
+from taichi_edges.scene import PRESETS, SCALES, SceneConfig
+from taichi_edges.scene_file import check_scene, load_scene
 
 SCENES = sorted((Path(__file__).parent.parent / "scenes").glob("*.yaml"))
 SYNTHETIC = "source: {reader: synthetic, part: block}\n"
@@ -240,8 +240,12 @@ def test_a_file_that_is_no_scene_is_named(tmp_path, content, says):
     assert message.startswith(f"{path}: ") and says in message
 
 
-def test_a_folder_is_no_scene(tmp_path):
-    assert refusal(tmp_path).startswith(f"{tmp_path}: is a folder, not a scene file")
+def test_a_folder_is_a_scene_without_keys(tmp_path):
+    folder = tmp_path / "my photos"
+    folder.mkdir()
+    config = load_scene(folder, settings=["fit.delta=0.3"], seed=3, scale="room")
+    assert (config.name, config.source.reader, config.source.path) == ("my-photos", "auto", str(folder))
+    assert (config.fit.delta, config.seed, config.scale) == (0.3, 3, "room")
 
 
 def test_a_missing_scene_is_named_with_its_nearest_neighbour(tmp_path, scene):
@@ -346,3 +350,59 @@ def test_an_unknown_preset_is_refused(scene):
 def test_a_scene_cannot_be_changed_after_loading(scene):
     with pytest.raises(Exception, match="frozen"):
         load_scene(scene()).train.epochs = 3
+
+
+@pytest.mark.parametrize(
+    ("written", "meant"),
+    [("auto", "auto"), ("off", "off"), (False, "off"), (True, "auto"), (4, 4), (["a", "b"], ["a", "b"])],
+)
+def test_views_are_held_out_by_number_or_name(written, meant):
+    scene = {"source": {"reader": "emap", "path": "x"}, "evaluation": {"held_out": written}}
+    assert check_scene(scene, "the test").evaluation.held_out == meant
+    for wrong in (0, -1, 2.5, "some", [], [3]):
+        scene["evaluation"] = {"held_out": wrong}
+        with pytest.raises(UserError, match="evaluation.held_out: must be auto, off or a number, or a list of names"):
+            check_scene(scene, "the test")
+
+
+# ------------------------------------------------------------------------------------------------------------ scales
+
+
+def test_every_preset_knows_every_scale():
+    scales = SceneConfig.model_fields["scale"].annotation.__args__
+    assert set(SCALES) == set(scales)
+    assert all(set(of_scale) == set(PRESETS) for of_scale in SCALES.values())
+
+
+@pytest.mark.parametrize("scale", ["building", "room"])
+def test_large_scenes_have_the_numbers_of_the_supplement(scene, scale):
+    train = load_scene(scene(f"preset: paper\nscale: {scale}")).train
+    assert (train.orient_weight, train.shape_weight, train.neighbors) == (0.01, 0.01, 4)
+    assert train.seeds == "auto"  # SfM points, where there are any
+
+
+def test_a_scale_lies_between_the_preset_and_the_scene(scene):
+    config = load_scene(scene("preset: paper\nscale: room\ntrain: {orient_weight: 0.5}"))
+    assert (config.train.orient_weight, config.train.shape_weight, config.train.epochs) == (0.5, 0.01, 500)
+
+
+def test_a_preset_on_the_command_line_brings_what_it_says_for_the_scale(scene):
+    path = scene("scale: building")
+    assert load_scene(path).train.orient_weight == 0.1  # the preset fast says nothing of buildings
+    assert load_scene(path, preset="paper").train.orient_weight == 0.01
+    assert load_scene(path, preset="paper", settings=["train.orient_weight=0.3"]).train.orient_weight == 0.3
+
+
+def test_a_scale_on_the_command_line_replaces_that_of_the_scene(scene):
+    path = scene("preset: paper\nscale: building")
+    config = load_scene(path, scale="object")
+    assert (config.scale, config.train.orient_weight) == ("object", 0.1)
+    config = load_scene(scene("train: {orient_weight: 0.5}"), preset="paper", scale="room")
+    assert (config.scale, config.train.orient_weight) == ("room", 0.01)
+
+
+def test_an_unknown_scale_is_refused(scene):
+    assert "scale: must be 'object', 'building' or 'room', not 'city'" in refusal(scene("scale: city"))
+    assert "scale: must be" in refusal(scene("scale: [room]"))
+    assert refusal(scene(), scale="city").startswith("--scale city: there is no such scale; there is object, building")
+    assert "use --scale room" in refusal(scene(), settings=["scale=room"])

@@ -26,6 +26,7 @@ SAMPLE_SPACING = 0.005  # normalised units, EMAP sample_resolution
 VOXELS_PER_UNIT = 128  # EMAP: 256 voxels over [-1, 1] on each axis
 THRESHOLDS_MM = (5, 10, 20)  # EMAP
 UNIT_MM = 1000.0  # "mm" in one normalised unit
+HELD_OUT_SHARES = ("precision", "chance", "judged", "recall_long", "recall", "f_score")  # of what is printed
 FEWEST_CHORDS = 16  # of a cubic, for exact distances; one of 90 degrees is met to 0.1 % of its radius
 
 
@@ -141,11 +142,11 @@ def sample_prediction(edges):
     return average_per_voxel(np.concatenate(samples).astype(np.float32))
 
 
-def average_per_voxel(points):
-    """(n, 3) float32 -> (m, 3) float32, the mean of the points of each voxel that has any."""
+def average_per_voxel(points, per_unit=VOXELS_PER_UNIT):
+    """(n, 3) float32 -> (m, 3) float32, the mean of the points of each voxel, `per_unit` on a unit, that has any."""
     if not len(points):
         return points
-    voxels = np.floor((points + np.float32(1.0)) * np.float32(VOXELS_PER_UNIT)).astype(np.int64)
+    voxels = np.floor((points + np.float32(1.0)) * np.float32(per_unit)).astype(np.int64)
     _, owner, counts = np.unique(voxels, axis=0, return_inverse=True, return_counts=True)
     sums = [np.bincount(owner.ravel(), weights=points[:, axis], minlength=len(counts)) for axis in range(3)]
     return (np.stack(sums, axis=1) / counts[:, None]).astype(np.float32)
@@ -213,7 +214,7 @@ def metrics_rows(metrics):
     for threshold in THRESHOLDS_MM:
         for label, key in (("precision", "precision"), ("recall", "recall"), ("F-score", "f_score")):
             rows.append((f"{label} at {threshold} mm", f"{metrics[f'{key}_{threshold}mm_percent']:.1f} %"))
-    return rows
+    return rows + held_out_rows(metrics)
 
 
 def rows_alone(metrics):
@@ -225,7 +226,23 @@ def rows_alone(metrics):
         ("length", number_text(metrics["predicted_length_units"], "{:.2f} units")),
         ("duplicated length", number_text(metrics["duplicated_length_percent"], "{:.1f} %")),
         ("free ends", number_text(metrics["free_ends"], "{:d}")),
+        *held_out_rows(metrics),
         ("ground truth", "none"),
+    ]
+
+
+def held_out_rows(metrics):
+    """What the held-out views say (`held_out.held_out_metrics`) as rows; none where there are none."""
+    if not metrics["held_out_views"]:
+        return []
+    percent = {key: number_text(metrics[f"held_out_{key}_percent"], "{:.1f} %") for key in HELD_OUT_SHARES}
+    aside = f"by chance {percent['chance']}; judged: {percent['judged']} of the length"
+    return [
+        ("held-out views", number_text(metrics["held_out_views"], "{:d}")),
+        ("held-out precision", f"{percent['precision']} ({aside})"),
+        ("held-out recall", f"{percent['recall_long']} of long edges, {percent['recall']} of all"),
+        ("held-out F-score", percent["f_score"]),
+        ("held-out distance", spread_text(metrics, ("held_out_residual_median_px", "held_out_residual_p90_px"))),
     ]
 
 
@@ -250,7 +267,7 @@ def free_ends_text(metrics):
 
 
 def spread_text(metrics, keys):
-    """'0.31 mm mean, 0.22 mm median, 0.95 mm p95', of those of the keys; 'unknown' where they are."""
+    """'0.31 mm mean, 0.22 mm median, 0.95 mm p95', of those of the keys, in their units; 'unknown' where they are."""
     if metrics[keys[0]] is None:
         return "unknown"
-    return ", ".join(f"{metrics[key]:.2f} mm {key.split('_')[-2]}" for key in keys)
+    return ", ".join(f"{metrics[key]:.2f} {key.split('_')[-1]} {key.split('_')[-2]}" for key in keys)

@@ -41,6 +41,11 @@ def build_geometries(points, directions, wireframe):
     return geometries
 
 
+def has_display():
+    """Whether a window can be opened, as far as that can be told without trying: only Linux tells by a variable."""
+    return not sys.platform.startswith("linux") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
+
+
 def show(points, directions, wireframe, written_files):
     """Open a window and return when it is closed.
 
@@ -48,7 +53,7 @@ def show(points, directions, wireframe, written_files):
     display.
     """
     instead = f"open {', '.join(str(name) for name in written_files)} instead"
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if not has_display():
         raise UserError(f"viewer: no display (neither DISPLAY nor WAYLAND_DISPLAY is set); {instead}")
     geometries = build_geometries(points, directions, wireframe)
     if not geometries:

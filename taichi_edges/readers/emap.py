@@ -1,32 +1,44 @@
-"""The layout of EMAP's ABC-NEF_Edge: `meta_data.json`, `camtoworld` with OpenCV axes, one folder for each detector."""
+"""EMAP's layout (ABC-NEF_Edge, Replica_Edge, DTU_Edge): `meta_data.json`, `color/`, a folder for each edge detector.
+
+`camtoworld` has OpenCV axes, pixel centres at integers. `scene_box.aabb` is the box of the scene; `worldtogt` leads to
+the frame of the ground truth. Images are PNG or, in Replica_Edge, JPEG, the maps of PiDiNet always PNG.
+"""
 
 from functools import partial
 
 import numpy as np
 
 from taichi_edges.errors import UserError
+from taichi_edges.readers.companions import companion, edge_paths, mask_paths
 from taichi_edges.readers.frames import Frames, matrix, read_json
 
+IMAGE_FOLDERS = ("color", "images", "image", "rgb")
 
-def read_emap(folder, config):
-    """Frames of an EMAP folder. config: the scene's `source` section."""
-    where = folder / "meta_data.json"
+
+def read_emap(path, config):
+    """Frames of an EMAP folder, or of a file like its meta_data.json. config: the scene's `source` section."""
+    where = path if path.is_file() else path / "meta_data.json"
+    folder = where.parent
     content = read_json(where, "an EMAP folder holds meta_data.json")
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{where}: has no 'frames'; is this EMAP's meta_data.json?")
-    images = config.images or ("color" if (folder / "color").is_dir() else "")
+    images = config.images or next((name for name in IMAGE_FOLDERS if (folder / name).is_dir()), "")
     names = [_name(frame, where) for frame in frames]
+    masks, warnings = mask_paths(folder, config, names)
     return Frames(
         where=where,
         names=[name.rsplit(".", 1)[0] for name in names],
-        edge_paths=[folder / config.edges / name if config.edges else "" for name in names],
-        image_paths=[folder / images / name if images else "" for name in names],
+        edge_paths=edge_paths(folder / config.edges, names) if config.edges else [""] * len(names),
+        image_paths=[companion(folder / images, name) or folder / images / name if images else "" for name in names],
         intrinsics=[partial(_intrinsics, frame, name, where) for frame, name in zip(frames, names, strict=True)],
         camera_to_world=[frame.get("camtoworld") for frame in frames],
         opengl=False,
         size=_size(content, where),
         input_to_truth=_input_to_truth(content, where),
+        mask_paths=masks,
+        box=_scene_box(content, where),
+        warnings=warnings,
     )
 
 
@@ -43,6 +55,17 @@ def _input_to_truth(content, where):
     if np.linalg.matrix_rank(values) < 4:
         raise UserError(f"{where}: worldtogt cannot be inverted; correct it or leave it out")
     return values
+
+
+def _scene_box(content, where):
+    """(2, 3) corners of the box the file gives, None without one."""
+    box = content.get("scene_box")
+    if not isinstance(box, dict) or box.get("aabb") is None:
+        return None
+    corners = matrix(box["aabb"], (2, 3), where, "scene_box.aabb")
+    if not (np.isfinite(corners).all() and (corners[1] > corners[0]).all()):
+        raise UserError(f"{where}: scene_box.aabb must be two corners, the second greater than the first in x, y and z")
+    return corners
 
 
 def _intrinsics(frame, name, where, width, height):

@@ -1,32 +1,377 @@
-"""Images and edge maps without the distortion of their lenses, made once and kept."""
+"""Pictures as a pinhole camera of one common size would have taken them, made once and kept in the run's folder.
 
-from dataclasses import replace
-from pathlib import Path
+Images, edge maps and masks are freed of the distortion of their lens, large ones are made smaller, and where views
+differ in size all are brought to one canvas, padded at the right and at the bottom, so that principal points stay.
+What needs none of it is used where it lies.
+"""
+
+import json
+import os
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from threading import Lock
 
 import cv2
 import numpy as np
 
-from taichi_edges.photogrammetry import undistorted, undistortion_map
+from taichi_edges.artefacts import digest, digest_file, replacing, write_json
+from taichi_edges.detectors.pictures import light_of_srgb, srgb_of_light
+from taichi_edges.errors import UserError
+from taichi_edges.photogrammetry import Lens, distorted_pixels, undistorted
+from taichi_edges.readers.frames import LEAVE_OUT, is_usable, refuse_views
+from taichi_edges.readers.picture_sizes import picture_size
 
+METHOD = 1  # raised when the same inputs give other pictures
 FOLDERS = {"image_paths": "images", "edge_paths": "edges", "mask_paths": "masks"}
+ROUNDING = 1.0  # px by which the aspect of a resized picture may be off
+OUTSIDE = 1.0  # px beyond the outermost centres of a picture; nearer, its border can be repeated
+# Edges keep to 0.014 px (median). Linear interpolation blurs them, here more and there less: 0.025 px. The overshoot of
+# OpenCV's cubics (0.016 px) is found as a faint edge 3 px beside a strong one.
+SHARP = cv2.INTER_LANCZOS4
+FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+LIGHT = 65535  # of a white pixel, while light is averaged
 
 
-def undistorted_frames(frames, folder):
-    """Frames whose files lie undistorted in `folder`."""
-    paths = {key: [] for key in FOLDERS}
-    intrinsics = []
-    for index, lens in enumerate(frames.lenses):
-        matrix, size = undistorted(lens)
-        maps = undistortion_map(lens, matrix, size)
-        intrinsics.append(lambda width, height, matrix=matrix: matrix)
-        for key, name in FOLDERS.items():
-            path = getattr(frames, key)[index]
-            if not path:
-                paths[key].append("")
-                continue
-            target = folder / name / f"{Path(path).stem}.png"
-            target.parent.mkdir(parents=True, exist_ok=True)
-            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-            cv2.imwrite(str(target), cv2.remap(image, maps, None, cv2.INTER_CUBIC))
-            paths[key].append(target)
-    return replace(frames, intrinsics=intrinsics, lenses=None, **paths)
+@dataclass(frozen=True)
+class Plan:
+    """How the pictures of a view come to what a pinhole camera would show.
+
+    lens: None for a pinhole camera. picture: (width, height) px of the photograph; shrunk: what it is made smaller to,
+    first; size: of the result; canvas: to which it is padded. intrinsics: (3, 3) as tuples, of the result.
+    """
+
+    lens: Lens | None
+    picture: tuple
+    shrunk: tuple
+    size: tuple
+    intrinsics: tuple
+    canvas: tuple = ()
+
+    @property
+    def changes_nothing(self):
+        """Whether a picture in the size of the photograph can stay as it is."""
+        return self.lens is None and self.picture == self.shrunk == self.canvas
+
+    def intrinsics_for(self, width, height):
+        """(3, 3); there is but one size."""
+        return np.array(self.intrinsics)
+
+
+def undistorted_frames(frames, folder, max_size, gamma=None, threads=None, progress=None):
+    """Frames whose pictures pinhole cameras took, all of one size; written to `folder` where they were not.
+
+    max_size: px of the longest side from which on photographs are made smaller, 0: never. gamma: see `as_picture`.
+    """
+    sizes = _picture_sizes(frames, threads)
+    as_told = len(set(sizes)) == 1 and frames.size in (None, sizes[0])
+    if not any(frames.lenses) and not (as_told and 0 < max_size < max(sizes[0])):
+        return frames  # small ones need nothing, and what is not as the layout says is refused later
+    _check_lenses(frames, sizes, progress)
+    plans = _plans(frames, sizes, max_size)
+    made = _make_all(frames, plans, Path(folder), gamma, threads, progress)
+    return replace(
+        frames,
+        intrinsics=[plan.intrinsics_for for plan in plans],
+        lenses=[None] * len(plans),
+        size=plans[0].canvas,
+        **made,
+    )
+
+
+def _picture_sizes(frames, threads):
+    """(V,) (width, height) of each view's photograph, else of its edge map, else of its lens."""
+
+    def size_of(view):
+        usable = (path for path in (frames.image_paths[view], frames.edge_paths[view]) if is_usable(path))
+        found = next(filter(None, map(picture_size, usable)), None)
+        lens = frames.lenses[view]
+        return found or ((lens.width, lens.height) if lens else (0, 0))
+
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(size_of, range(len(frames.names))))
+
+
+def _check_lenses(frames, sizes, progress):
+    """UserError where a photograph cannot be what its camera took; a word on those that were resized."""
+    lenses = [(lens.width, lens.height) if lens else size for lens, size in zip(frames.lenses, sizes, strict=True)]
+    pairs = list(zip(sizes, lenses, strict=True))
+    wrong = np.array([not _same_aspect(*pair) for pair in pairs])
+    turned = np.array([_same_aspect(size, lens[::-1]) for size, lens in pairs]) & wrong
+    problem = "{} is {} x {} px, but its camera is {} x {} px"
+    if wrong.any():
+        first = int((turned if turned.any() else wrong).argmax())
+        problem = problem.format("the image", *sizes[first], *lenses[first])
+    cure = "turned: a program has rotated the file by its EXIF orientation; use the images that the cameras are of"
+    refuse_views(frames, turned, f"{problem}, {cure}, or export both again, {LEAVE_OUT}")
+    refuse_views(frames, wrong, f"{problem}, of another shape; use the images that the cameras are of, {LEAVE_OUT}")
+    resized = [pair for pair in pairs if pair[0] != pair[1]]
+    if resized and progress:
+        size, lens = resized[0]
+        what = f"images of {size[0]} x {size[1]} px for cameras of {lens[0]} x {lens[1]} px"
+        progress.say(f"{len(resized)} of {len(pairs)} views have {what}: the intrinsics are scaled to them")
+
+
+def _same_aspect(size, other):
+    """Can one be the other resized, sides rounded to whole pixels?"""
+    small, large = sorted((size, other))
+    (width, height), (full_width, full_height) = small, large
+    if not all((*size, *other)):
+        return False
+    across, down = width / full_width, height / full_height
+    return abs(full_width * down - width) <= ROUNDING or abs(full_height * across - height) <= ROUNDING
+
+
+def _plans(frames, sizes, max_size):
+    """(V,) Plan, with one canvas."""
+    plan = lru_cache(maxsize=None)(_plan)
+    alone = [
+        plan(lens, size, max_size) if lens else _plan(None, size, max_size, intrinsics_for(*size))
+        for lens, size, intrinsics_for in zip(frames.lenses, sizes, frames.intrinsics, strict=True)
+    ]
+    canvas = tuple(max(each.size[axis] for each in alone) for axis in (0, 1))
+    return [replace(each, canvas=canvas) for each in alone]
+
+
+def _plan(lens, picture, max_size, intrinsics=None):
+    shrink = min(1.0, max_size / max(picture)) if max_size else 1.0
+    shrunk = tuple(max(round(side * shrink), 1) for side in picture)
+    if lens is None:
+        return Plan(None, picture, shrunk, shrunk, _as_tuples(_scaled(intrinsics, picture, shrunk)))
+    own = (lens.width, lens.height)
+    intrinsics, size = undistorted(lens)
+    scaled = _as_tuples(_scaled(intrinsics, own, shrunk))
+    if lens.is_pinhole:
+        return Plan(None, picture, shrunk, shrunk, scaled)
+    size = tuple(max(round(side * new / old), 1) for side, new, old in zip(size, shrunk, own, strict=True))
+    return Plan(lens, picture, shrunk, size, scaled)
+
+
+def _scaled(intrinsics, old, new):
+    """Intrinsics for pictures resized from the old (width, height) to the new: borders stay borders.
+
+    Pixel centres are at integers, so a coordinate c becomes (c + 0.5) s - 0.5.
+    """
+    scale = np.array([new[0] / old[0], new[1] / old[1]])
+    scaled = np.array(intrinsics, dtype=np.float64)
+    scaled[:2, 2] += 0.5
+    scaled[:2] *= scale[:, None]
+    scaled[:2, 2] -= 0.5
+    return scaled
+
+
+def _as_tuples(matrix):
+    return tuple(tuple(float(value) for value in row) for row in matrix)
+
+
+class _Maps:
+    """The maps of lenses, each computed once; some are kept while the views that share them are made."""
+
+    def __init__(self, kept):
+        self.lock, self.find = Lock(), lru_cache(maxsize=kept)(undistortion_map)
+
+    def __call__(self, plan):
+        with self.lock:
+            return self.find(plan.lens, plan.intrinsics, plan.size, plan.shrunk)
+
+
+def undistortion_map(lens, intrinsics, size, picture):
+    """Where in the picture of a lens each pixel of the undistorted picture lies, as cv2.remap wants; and where not.
+
+    intrinsics, size: of the undistorted picture. picture: (width, height) of the lens's, whatever it was resized to.
+    Returns (H, W, 2) float32 pixels and (H, W) bool, False where the picture shows nothing.
+    """
+    (width, height), scale = size, np.array(picture) / (lens.width, lens.height)
+    inverse = np.linalg.inv(np.array(intrinsics))
+    pixels = np.empty((height, width, 2), np.float32)
+    columns = np.arange(width)
+    for row in range(height):  # one row at a time, or doubles take many times the memory of a picture
+        rays = np.stack([columns, np.full(width, row), np.ones(width)], axis=1) @ inverse.T
+        pixels[row] = (distorted_pixels(lens, rays) + 0.5) * scale - 0.5
+    with np.errstate(invalid="ignore"):
+        inside = ((pixels >= -OUTSIDE) & (pixels <= np.array(picture) - 1 + OUTSIDE)).all(axis=2)
+    valid = inside & _unfolded(pixels, np.array(intrinsics)[:2, 2])
+    return np.where(valid[:, :, None], pixels, np.float32(-2 * OUTSIDE)), valid
+
+
+def _unfolded(pixels, centre):
+    """(H, W) bool: the part about the principal point in which the map (H, W, 2) does not turn back.
+
+    Polynomials for distortion hold for the field of view that they were fitted in; beyond, they fold the picture over.
+    """
+    right, down = np.gradient(pixels, axis=1), np.gradient(pixels, axis=0)
+    with np.errstate(invalid="ignore"):
+        forward = right[:, :, 0] * down[:, :, 1] - right[:, :, 1] * down[:, :, 0] > 0
+    if forward.all():
+        return forward
+    _, labels = cv2.connectedComponents(forward.astype(np.uint8), connectivity=4)
+    column, row = (int(np.clip(np.rint(c), 0, s - 1)) for c, s in zip(centre, forward.shape[::-1], strict=True))
+    return forward & (labels == labels[row, column])
+
+
+def _make_all(frames, plans, folder, gamma, threads, progress):
+    """The paths of the pictures, by field of Frames: those that were made, and those that need not be."""
+    index = folder / "index.json"
+    known = _known(index)
+    valid = _valid_areas(plans, folder, known)
+    paths = {**{key: list(getattr(frames, key)) for key in FOLDERS}, "valid_paths": valid}
+    jobs = []
+    for view, (name, plan) in enumerate(zip(frames.names, plans, strict=True)):
+        for key, kind in FOLDERS.items():
+            source = paths[key][view]
+            if is_usable(source) and not (plan.changes_nothing and picture_size(source) == plan.canvas):
+                target = folder / kind / f"{_safe(name)}.png"
+                paths[key][view] = target
+                jobs.append((Path(source), target, kind, plan))
+    names = Counter(target for _, target, _, _ in jobs)
+    assert max(names.values(), default=1) == 1, names.most_common(1)
+    _make(jobs, folder, known, gamma, threads, progress)
+    return paths
+
+
+def _safe(name):
+    """A view's name as a path that stays in its folder."""
+    return "/".join(part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "..", "."))
+
+
+def _known(index):
+    try:
+        content = json.loads(index.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _make(jobs, folder, known, gamma, threads, progress):
+    """Make the pictures that are not there as they should be; (source, target, kind, Plan) each."""
+    keys = [_key(source, kind, plan, gamma) for source, _, kind, plan in jobs]
+    labels = [target.relative_to(folder).as_posix() for _, target, _, _ in jobs]
+    due = [i for i, (_, target, _, _) in enumerate(jobs) if known.get(labels[i]) != keys[i] or not target.is_file()]
+    if not due:
+        return
+    maps, exponent = _Maps(kept=max(threads or os.cpu_count(), 1)), gamma or None
+
+    def make(i):
+        source, target, kind, plan = jobs[i]
+        image = _read(source)
+        _check_fits(source, image, plan)
+        _write(target, brought(image, plan, kind, maps, exponent))
+        return i
+
+    try:
+        with progress.track("undistort", len(due)) as report, ThreadPoolExecutor(threads) as pool:
+            for done, i in enumerate(pool.map(make, due)):
+                known[labels[i]] = keys[i]
+                report(done + 1)
+    finally:
+        write_json(folder / "index.json", known)
+
+
+def _key(source, kind, plan, gamma):
+    return digest([METHOD, kind, digest_file(source), asdict(plan), gamma if kind == "images" else None])
+
+
+def _read(path):
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise UserError(f"{path}: not an image that can be read; write it again, {LEAVE_OUT}")
+    return image
+
+
+def _check_fits(path, image, plan):
+    """UserError where an edge map or a mask cannot be of its image."""
+    size = (image.shape[1], image.shape[0])
+    if not _same_aspect(size, plan.picture):
+        what = f"{size[0]} x {size[1]} px, but its image is {plan.picture[0]} x {plan.picture[1]} px"
+        turned = _same_aspect(size[::-1], plan.picture)
+        why = "turned by the image's EXIF orientation, which cameras do not know" if turned else "of another shape"
+        raise UserError(f"{path}: this is {what}, {why}; write it in that size, {LEAVE_OUT}")
+
+
+def _write(path, image):
+    with replacing(path) as unfinished:
+        unfinished.write_bytes(cv2.imencode(".png", image, FAST_PNG)[1])
+
+
+def brought(image, plan, kind, maps, exponent=None):
+    """One picture as its Plan says: an image (in linear light, as a camera would), an edge map or a mask.
+
+    Edge maps and masks need not be in the size of the image, but show the same.
+    """
+    if kind != "images":
+        return _warped(image, plan, maps, cv2.INTER_LINEAR if kind == "masks" else cv2.INTER_CUBIC)
+    if image.dtype != np.uint8:
+        return _warped(image, plan, maps, SHARP)
+    into_light, from_light = _tables(exponent)
+    light = cv2.LUT(image, into_light) if image.ndim == 2 or image.shape[2] == 3 else _covered(image, into_light)
+    warped = _warped(light, plan, maps, SHARP)
+    return from_light[warped] if warped.ndim == 2 or warped.shape[2] == 3 else _uncovered(warped, from_light)
+
+
+@lru_cache(maxsize=4)
+def _tables(exponent):
+    """From 8-bit values to light, (256,) uint16, and back, (65536,) uint8."""
+    shades, light = np.linspace(0, 1, 256), np.linspace(0, 1, LIGHT + 1)
+    into = light_of_srgb(shades) if exponent is None else shades**exponent
+    back = srgb_of_light(light) if exponent is None else light ** (1 / exponent)
+    return np.rint(LIGHT * into).astype(np.uint16), np.rint(255 * back).astype(np.uint8)
+
+
+def _covered(image, into_light):
+    """Light times alpha, and alpha, (H, W, 4) float32: the colours of what is transparent mean nothing."""
+    alpha = image[:, :, -1:].astype(np.float32) / 255
+    return np.concatenate([into_light[image[:, :, :-1]] * alpha, LIGHT * alpha], axis=2)
+
+
+def _uncovered(warped, from_light):
+    alpha = warped[:, :, -1:] / LIGHT
+    light = np.clip(warped[:, :, :-1] / np.maximum(alpha, 1 / LIGHT), 0, LIGHT)  # both overshoot alike
+    alpha = np.rint(255 * np.clip(alpha, 0, 1)).astype(np.uint8)
+    return np.concatenate([from_light[np.rint(light).astype(np.uint16)], alpha], axis=2)
+
+
+def _warped(image, plan, maps, interpolation):
+    """A picture shrunk, undistorted, and padded with zeros to the canvas."""
+    image = _resized(image, plan.shrunk)
+    if plan.lens is not None:
+        pixels, _ = maps(plan)
+        image = cv2.remap(image, pixels, None, interpolation, borderMode=cv2.BORDER_REPLICATE)
+    right, bottom = (canvas - size for canvas, size in zip(plan.canvas, plan.size, strict=True))
+    return cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_CONSTANT, value=0) if right or bottom else image
+
+
+def _resized(image, size):
+    """cv2.resize lays borders over each other, not the centres of the first pixels, as `_scaled` does."""
+    if (image.shape[1], image.shape[0]) == size:
+        return image
+    smaller = size[0] <= image.shape[1]
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+
+
+def _valid_areas(plans, folder, known):
+    """(V,) pictures of where each view shows something, 255, or nothing, 0; '' where it does everywhere."""
+    paths = {}
+    for plan in dict.fromkeys(plans):
+        key = digest([METHOD, asdict(plan)])
+        target = folder / "valid" / f"{key[:16]}.png"
+        label = f"valid/{target.name}"
+        if label not in known or (known[label] and not target.is_file()):
+            area = _valid_area(plan)
+            if not area.all():
+                _write(target, np.uint8(255) * area)
+            known[label] = "" if area.all() else key
+            write_json(folder / "index.json", known)
+        paths[plan] = target if known[label] else ""
+    return [paths[plan] for plan in plans]
+
+
+def _valid_area(plan):
+    valid = np.zeros(plan.canvas[::-1], bool)
+    width, height = plan.size
+    lens = plan.lens
+    valid[:height, :width] = (
+        True if lens is None else undistortion_map(lens, plan.intrinsics, plan.size, plan.shrunk)[1]
+    )
+    return valid

@@ -1,0 +1,244 @@
+"""Edges against views that were held out of everything that found them: a truth that every scene has.
+
+The edges are projected into each of these views and held against the sub-pixel edgels there. What is hidden there must
+not count as wrong. No surface is known, but the views that the edges were made from say from where each place of an
+edge is seen: a place that they see, but not those that look from nearly the direction of the held-out view, is expected
+to be hidden from there, and is not judged. A place that no more of them see than would by chance is judged: it is on an
+edge that does not exist.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from taichi_edges.edgels import Edgels
+from taichi_edges.errors import UserError, did_you_mean
+from taichi_edges.evaluation.edgel_index import MOST_SINE, EdgelIndex
+from taichi_edges.evaluation.projected_curves import Camera, Chords
+from taichi_edges.views import pixel_size
+
+FEWEST_VIEWS, SHARE, MOST = 8, 10, 3  # auto: from so many views on, one in ten of them, at most three
+LEAST_LEFT = 3  # views to find edges in: the viewing planes of two always meet
+MATCH_PX = 1.5  # an edge and an edgel so near are one, if they are parallel too (MOST_SINE); as in edges/evidence.py
+REACH_PX = (
+    3.0  # within which residuals are looked at, and misplaced edges still seen: what is this far off is no match,
+)
+# but neither hidden
+SPACING_PX = 0.75  # of the samples of a projected edge: edgels are about 1 px apart
+PLACE_PX = 4.0  # between the places of an edge that the views are asked about, at the middle of the scene box
+MOST_PLACES = 20_000  # of all edges; where these are longer, the places are farther apart
+NEIGHBORS = 8  # views nearest by direction that say whether a place is visible from there, by angle^-2 each,
+VISIBLE = 0.7  # and how much of their weight must see it: of the true edges of synthetic parts, one in twenty of the
+# places that are hidden passes, and three in four of those that are visible
+LEAST_ANGLE = 1e-6  # radians^2; directions nearer than a milliradian are one
+SURE = 3.0  # standard deviations beyond the number of views that would see an edgel at a place by chance
+ASIDE_PX = 12.0  # displacement at which agreement is chance: farther than edges are wrong, within the same texture
+ASIDE_EVERY = 4  # samples that are displaced: chance needs no more
+
+
+# ------------------------------------------------------------------------------------------ which views are held out
+
+
+def choose_held_out(names, wanted):
+    """Indices of the views to hold out, ascending. wanted: 'auto', 'off', a number, or a tuple of names.
+
+    Those that `auto` and a number choose are in the middles of equal stretches of all views; the first and the last
+    stay, at the ends of a path of cameras.
+    """
+    if isinstance(wanted, (tuple, list)):
+        for name in wanted:
+            if name not in names:
+                raise UserError(f"evaluation.held_out: there is no view '{name}'{did_you_mean(name, list(names))}")
+        chosen = {list(names).index(name) for name in wanted}
+    else:
+        count = {"off": 0, "auto": _automatic(len(names))}.get(wanted, wanted)
+        middles = ((2 * number + 1) * len(names) // (2 * count) for number in range(count))
+        chosen = {min(max(middle, 1), len(names) - 2) for middle in middles}
+    left = len(names) - len(chosen)
+    if chosen and (left < LEAST_LEFT or left < len(chosen)):
+        problem = f"{len(chosen)} of {len(names)} views leave too few to find edges in"
+        raise UserError(f"evaluation.held_out: {problem}; hold out at most half of them, and leave {LEAST_LEFT}")
+    return sorted(chosen)
+
+
+def _automatic(count):
+    """How many of so many views `auto` holds out."""
+    return min((count + SHARE // 2) // SHARE, MOST) if count >= FEWEST_VIEWS else 0
+
+
+def split_views(views, held_out):
+    """Views without those at the indices `held_out`, and Views of those alone."""
+    rest = [view for view in range(len(views)) if view not in set(held_out)]
+    return _some_views(views, rest), _some_views(views, held_out)
+
+
+def _some_views(views, chosen):
+    edgels = views.edgels
+    return replace(
+        views,
+        names=tuple(views.names[view] for view in chosen),
+        image_paths=tuple(views.image_paths[view] for view in chosen),
+        edge_maps=views.edge_maps[chosen],
+        intrinsics=views.intrinsics[chosen],
+        world_to_camera=views.world_to_camera[chosen],
+        edgels=None if edgels is None else Edgels.of_views([edgels.of_view(view) for view in chosen]),
+    )
+
+
+# ------------------------------------------------------------------------------------------------------- visibility
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """What views show of some places on edges.
+
+    places: (n, 3). inside, seen: (n, V) bool: the view has the place in its image; it has an edgel within REACH_PX.
+    towards: (n, V, 3) unit directions to the cameras. real: (n,) bool, more views match it than would by chance.
+    """
+
+    places: np.ndarray
+    inside: np.ndarray
+    seen: np.ndarray
+    towards: np.ndarray
+    real: np.ndarray
+
+    @staticmethod
+    def of(places, tangents, views):
+        """Of (n, 3) places with unit tangents, unit cube, in Views."""
+        inside, seen, matched = np.zeros((3, len(places), len(views)), bool)
+        towards, chance = np.zeros((len(places), len(views), 3)), np.zeros(len(views))
+        for view in range(len(views)):
+            camera, (points, normals, _) = Camera.of(views, view), views.edgels.of_view(view)
+            pixels, along, inside[:, view] = camera.project(places, tangents)
+            there = np.flatnonzero(inside[:, view])
+            index = EdgelIndex.of(points, normals, views.width, views.height)
+            at, _, away = index.agreeing(pixels[there], along[there], REACH_PX)
+            seen[there[at], view] = True
+            matched[there[at[np.abs(away) <= MATCH_PX]], view] = True
+            towards[:, view] = _unit(camera.centre - places)
+            chance[view] = chance_of_match(points)
+        expected, variance = inside @ chance, inside @ (chance * (1.0 - chance))
+        enough = np.maximum(expected + SURE * np.sqrt(variance), LEAST_LEFT)
+        return Sightings(places, inside, seen, towards, matched.sum(axis=1) >= enough)
+
+    def judged_from(self, centre):
+        """(n,) bool: which places a view from `centre` (3,) ought to show, or are nowhere to be seen."""
+        cosines = np.einsum("nvc,nc->nv", self.towards, _unit(centre - self.places))
+        nearest = np.argsort(np.where(self.inside, -cosines, np.inf), axis=1, kind="stable")[:, :NEIGHBORS]
+        cosines, inside, seen = (np.take_along_axis(of, nearest, axis=1) for of in (cosines, self.inside, self.seen))
+        weights = inside / np.maximum(2.0 - 2.0 * cosines, LEAST_ANGLE)
+        return ~self.real | ((weights * seen).sum(axis=1) >= VISIBLE * weights.sum(axis=1))
+
+
+def _unit(vectors):
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
+
+
+def chance_of_match(points):
+    """Share of the places of an image within whose MATCH_PX some edgel happens to run their way. points: (e, 2)."""
+    if not len(points):
+        return 0.0
+    density = len(points) / np.prod(np.ptp(points, axis=0) + 1.0)  # px of edge for each px^2
+    turned = 2.0 * np.arcsin(MOST_SINE) / np.pi
+    return 1.0 - np.exp(-2.0 * MATCH_PX * density * turned)
+
+
+# ---------------------------------------------------------------------------------------------------------- metrics
+
+
+@dataclass(frozen=True)
+class Score:
+    """What held-out views say, sums over them that divide into shares.
+
+    length, judged, matched: px of projected edges, of these the judged ones, and of these the matched ones. displaced,
+    by_chance: px of judged edges that were displaced, and of these the matched ones. edgels, explained: strengths of
+    the edgels, and of those that edges explain; long_edgels, long_explained: of those on long edges. residuals:
+    distances of the judged samples from their edgels, px.
+    """
+
+    length: float
+    judged: float
+    matched: float
+    displaced: float
+    by_chance: float
+    edgels: float
+    explained: float
+    long_edgels: float
+    long_explained: float
+    residuals: np.ndarray
+
+
+def held_out_metrics(polylines, training, held_out):
+    """The metrics of edges in held-out views, a dict that JSON can hold; None where a number does not exist.
+
+    polylines: list of (m, 3), unit cube. training: Views that the edges were made from. held_out: Views.
+    """
+    scores = []
+    chords = Chords.of(polylines)
+    if len(held_out):
+        spacing = max(PLACE_PX * pixel_size(training), chords.travelled[-1] / MOST_PLACES)
+        places, tangents, ends = chords.places(spacing)
+        sightings = Sightings.of(places, tangents, training)
+        scores = [score_view(chords, ends, sightings, held_out, view) for view in range(len(held_out))]
+    return {"held_out_views": len(held_out), **metrics_of(scores)}
+
+
+def score_view(chords, ends, sightings, views, view):
+    """Score of Chords in one of some Views. ends: (n,) where on the Chords the stretch of each place ends."""
+    camera, (points, normals, strengths) = Camera.of(views, view), views.edgels.of_view(view)
+    index = EdgelIndex.of(points, normals, views.width, views.height)
+    traces = chords.in_image(camera, SPACING_PX)
+    place = np.minimum(np.searchsorted(ends, traces.travelled), len(ends) - 1)
+    judged = sightings.judged_from(camera.centre)[place] if len(traces) else np.zeros(0, bool)
+    at, edgels, beside = index.agreeing(traces.pixels, traces.along, REACH_PX)
+    away = np.linalg.norm(traces.pixels[at] - points[edgels], axis=1)
+    distances = np.full(len(traces), np.inf)
+    np.minimum.at(distances, at, away)
+    nearest = (away == distances[at]) & judged[at]
+    explained = np.zeros(len(points), bool)
+    explained[edgels[away <= MATCH_PX]] = True
+    long = index.on_long_edges()
+    matched = judged & (distances <= MATCH_PX)
+    displaced, by_chance = _displaced(index, traces, judged)
+    return Score(
+        *(float(traces.lengths[some].sum()) for some in (slice(None), judged, matched)),
+        *(displaced, by_chance),
+        *(float(strengths[some].sum(dtype=np.float64)) for some in (slice(None), explained, long, long & explained)),
+        residuals=np.abs(beside[nearest]),
+    )
+
+
+def _displaced(index, traces, judged):
+    """Length of judged samples that are displaced to both sides, and of those of them that match there, px."""
+    some = np.flatnonzero(judged)[::ASIDE_EVERY]
+    length = matched = 0.0
+    for side in (-ASIDE_PX, ASIDE_PX):
+        along = traces.along[some]
+        places = traces.pixels[some] + side * np.stack([-along[:, 1], along[:, 0]], axis=1)
+        found = np.unique(index.agreeing(places, along, MATCH_PX)[0])
+        length, matched = length + traces.lengths[some].sum(), matched + traces.lengths[some[found]].sum()
+    return float(length), float(matched)
+
+
+def metrics_of(scores):
+    """The shares and residuals of all views together."""
+
+    def percent(part, whole):
+        total = sum(getattr(score, whole) for score in scores)
+        return 100.0 * sum(getattr(score, part) for score in scores) / total if total else None
+
+    residuals = np.concatenate([np.zeros(0), *(score.residuals for score in scores)])
+    precision, recall = percent("matched", "judged"), percent("long_explained", "long_edgels")
+    both = (precision or 0.0) + (recall or 0.0)
+    return {
+        "held_out_precision_percent": precision,
+        "held_out_chance_percent": percent("by_chance", "displaced"),
+        "held_out_judged_percent": percent("judged", "length"),
+        "held_out_recall_percent": percent("explained", "edgels"),
+        "held_out_recall_long_percent": recall,
+        "held_out_f_score_percent": (2.0 * (precision or 0.0) * (recall or 0.0) / both if both else 0.0)
+        if scores
+        else None,
+        "held_out_residual_median_px": float(np.median(residuals)) if len(residuals) else None,
+        "held_out_residual_p90_px": float(np.percentile(residuals, 90)) if len(residuals) else None,
+    }

@@ -1,0 +1,192 @@
+"""nerfstudio's `transforms.json`, which instant-ngp's resembles: OpenGL axes, lenses with distortion, masks, points.
+
+Intrinsics (fl_x, fl_y, cx, cy, w, h, k1 ... p2, camera_model) stand on top or in each frame; the centre of the first
+pixel is (0.5, 0.5), as in COLMAP. `applied_transform` and `applied_scale` say how the poses came from another frame;
+poses, points (`ply_file_path`), box and everything exported are in the frame of the file as it is.
+"""
+
+import os
+from pathlib import PurePosixPath
+
+import numpy as np
+
+from taichi_edges.cameras import OPENGL_TO_OPENCV
+from taichi_edges.errors import UserError
+from taichi_edges.photogrammetry import Lens
+from taichi_edges.readers.companions import companion, edge_paths, mask_paths
+from taichi_edges.readers.frames import Frames, read_json
+from taichi_edges.readers.picture_sizes import picture_size
+from taichi_edges.readers.points import read_cloud
+from taichi_edges.readers.scene_box import box_of_cameras, scene_box
+
+LISTING = "transforms.json"
+PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
+FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
+DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4")  # the first four as in COLMAP's OPENCV
+
+
+def read_nerfstudio(path, config):
+    """Frames of a nerfstudio or instant-ngp folder, or of a file like its transforms.json.
+
+    config: the scene's `source` section.
+    """
+    where = path if path.is_file() else path / LISTING
+    folder = where.parent
+    content = read_json(where, f"nerfstudio's folders hold {LISTING}")
+    listed = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(listed, list) or not listed:
+        raise UserError(f"{where}: has no 'frames'; is this a transforms.json of nerfstudio or instant-ngp?")
+    paths = [_file_path(frame, where) for frame in listed]
+    inner = _below_their_folder(paths)
+    images = [_image(folder, config.images, *names) for names in zip(paths, inner, strict=True)]
+    masks, warnings = _masks(folder, config, listed, inner)
+    lenses = [_lens({**content, **frame}, image, where) for frame, image in zip(listed, images, strict=True)]
+    poses = [frame.get("transform_matrix") for frame in listed]
+    points, files = _points(folder, content, where)
+    box, doubt = _box(points, poses, lenses, config)
+    return Frames(
+        where=where,
+        names=_view_names(inner),
+        edge_paths=edge_paths(folder / config.edges, inner) if config.edges else [""] * len(inner),
+        image_paths=images,
+        intrinsics=[None] * len(inner),
+        camera_to_world=poses,
+        opengl=True,
+        lenses=lenses,
+        mask_paths=masks,
+        points=points,
+        box=box,
+        files=files,
+        warnings=(*warnings, *doubt),
+    )
+
+
+def _file_path(frame, where):
+    """The image of a frame, relative to the file's folder or absolute."""
+    name = frame.get("file_path") if isinstance(frame, dict) else None
+    if not isinstance(name, str) or not PurePosixPath(name).name:
+        raise UserError(f"{where}: a frame without file_path; every frame names its image")
+    return PurePosixPath(os.path.normpath(name.replace("\\", "/")))
+
+
+def _below_their_folder(paths):
+    """(V,) the paths below the folder that all of them share, as edge maps and masks are named."""
+    shared = os.path.commonpath([path.parent for path in paths]) if len({p.is_absolute() for p in paths}) == 1 else ""
+    return [str(path.relative_to(shared)) if shared else str(path) for path in paths]
+
+
+def _view_names(inner):
+    """Names without suffixes, unless two would be the same."""
+    stems = [str(PurePosixPath(name).with_suffix("")) for name in inner]
+    return stems if len(set(stems)) == len(stems) else list(inner)
+
+
+def _image(folder, given, path, inner):
+    """Where the image of a frame is: what the file says, whatever its suffix, or that name in `source.images`."""
+    wanted = folder / given / inner if given else folder / path
+    if wanted.is_file():
+        return wanted
+    return companion(wanted.parent, wanted.name) or companion(wanted.parent, f"{wanted.name}.png") or wanted
+
+
+def _masks(folder, config, listed, inner):
+    """(V,) masks, '' where a view has none, and warnings; those the file names, unless the scene names others."""
+    named = [frame.get("mask_path") for frame in listed]
+    if config.masks or not any(named):
+        return mask_paths(folder, config, inner)
+    return [folder / name if isinstance(name, str) and name else "" for name in named], ()
+
+
+def _lens(values, image, where):
+    """The Lens of a frame, whose own values go before those of the file."""
+    name = values["file_path"]
+    width, height = _size(values, image, where, name)
+    focal_x = _number(values, "fl_x", where, name) or _focal(values, "camera_angle_x", width, where, name)
+    focal_y = _number(values, "fl_y", where, name) or _focal(values, "camera_angle_y", height, where, name)
+    focal_x, focal_y = focal_x or focal_y, focal_y or focal_x
+    if not focal_x:
+        raise UserError(f"{where}: {name} has neither fl_x nor camera_angle_x; add one of them, to the frame or on top")
+    centre = [_number(values, key, where, name, side / 2) for key, side in (("cx", width), ("cy", height))]
+    k1, k2, p1, p2, k3, k4 = (_number(values, key, where, name, 0.0) for key in DISTORTION)
+    pinhole = (focal_x, focal_y, *centre)
+    if _is_fisheye(values, where):
+        return Lens("OPENCV_FISHEYE", width, height, (*pinhole, k1, k2, k3, k4))
+    if k4:
+        problem = f"k4 of {name} is {k4:g}, which COLMAP's perspective lenses do not have"
+        raise UserError(f"{where}: {problem}; undistort the images before, or calibrate with k1, k2, k3, p1, p2")
+    if k3:
+        return Lens("FULL_OPENCV", width, height, (*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
+    if any((k1, k2, p1, p2)):
+        return Lens("OPENCV", width, height, (*pinhole, k1, k2, p1, p2))
+    return Lens("PINHOLE", width, height, pinhole)
+
+
+def _is_fisheye(values, where):
+    """instant-ngp says so by a key of its own."""
+    model = str(values.get("camera_model") or "OPENCV").upper()
+    if model not in (*PERSPECTIVE, *FISHEYE):
+        known = f"{', '.join(PERSPECTIVE)} and {FISHEYE[0]}"
+        raise UserError(f"{where}: camera_model {model} is not supported; {known} are: undistort the images before")
+    return model in FISHEYE or values.get("is_fisheye") is True
+
+
+def _number(values, key, where, name, default=None):
+    value = values.get(key)
+    if value is None:
+        return default
+    if type(value) not in (int, float) or not np.isfinite(value):
+        raise UserError(f"{where}: {key} of {name} must be a finite number, not {value!r}")
+    return float(value)
+
+
+def _focal(values, key, side, where, name):
+    """Pixels, from a field of view in radians across `side` pixels; None where the file has none."""
+    angle = _number(values, key, where, name)
+    if angle is None:
+        return None
+    if not 0 < angle < np.pi:
+        raise UserError(f"{where}: {key} of {name} must be between 0 and pi radians, not {angle:g}")
+    return 0.5 * side / np.tan(0.5 * angle)
+
+
+def _size(values, image, where, name):
+    """(width, height) in pixels as the file says, else of the image."""
+    sides = [_number(values, key, where, name) for key in ("w", "h")]
+    if None in sides:
+        size = picture_size(image) if image.is_file() else None
+        if size is None:
+            raise UserError(f"{where}: neither w and h nor the image tell how large {name} is; add w and h")
+        return size
+    if not all(side > 0 and side == int(side) for side in sides):
+        raise UserError(
+            f"{where}: w and h of {name} must be whole numbers of pixels, not {sides[0]:g} and {sides[1]:g}"
+        )
+    return int(sides[0]), int(sides[1])
+
+
+def _points(folder, content, where):
+    """(n, 3) the points of the file's PLY, None without, and the files read."""
+    name = content.get("ply_file_path")
+    if not isinstance(name, str) or not name:
+        return None, ()
+    path = folder / name
+    if not path.is_file():
+        raise UserError(f"{where}: ply_file_path: {path} is not there; copy it, or leave the key out")
+    return read_cloud(path, "ply_file_path"), (path,)
+
+
+def _box(points, poses, lenses, config):
+    """(2, 3) corners of the scene, None where nothing tells; and doubts."""
+    try:
+        poses = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
+    except (TypeError, ValueError):
+        return None, ()  # a pose is broken, which is said later, by name
+    poses = poses @ OPENGL_TO_OPENCV if config.axes != "opencv" else poses
+    if points is not None:
+        return scene_box(points, poses), ()
+    box = box_of_cameras(poses, [min(lens.width / lens.params[0], lens.height / lens.params[1]) for lens in lenses])
+    if box is None:
+        return None, ("no points, and the cameras do not look at one place: nothing tells where the scene is; set box",)
+    return box, (
+        "no points (ply_file_path) tell how large the scene is: the box is what the cameras look at; or set box",
+    )
