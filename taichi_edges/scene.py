@@ -257,6 +257,9 @@ class RefineConfig(Section):
     min_steadiness: Share = Field(
         0.66, description="share of the edgels about an edge that lie on it; contours have half"
     )
+    anchor: bool = Field(
+        False, description="hang up straight edges whose depth the views cannot tell on known ones that they meet"
+    )
     regularise: bool = Field(
         False, description="make edges parallel, perpendicular, coplanar, coaxial, of equal radius, if images allow"
     )
@@ -427,7 +430,7 @@ PHOTOGRAPHED = {
         "grow": 0.0,
     },
     "cluster": {"min_points": 5, "max_gap": 0.015},
-    "refine": {"min_support": 0.15, "min_views": 2.0, "min_steadiness": 0.3},
+    "refine": {"anchor": True, "min_support": 0.15, "min_views": 2.0, "min_steadiness": 0.3},
 }
 SCALES = {
     "object": {"paper": {}, "fast": {}},

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 
 from taichi_edges.edges.adjustment import adjusted
+from taichi_edges.edges.anchoring import anchored_lines
 from taichi_edges.edges.completion import completed
 from taichi_edges.edges.continuation import Merging, continued
 from taichi_edges.edges.evidence import (
@@ -38,13 +39,15 @@ class RefineCounts:
     """What the refinement did.
 
     circles: arcs that became whole circles. joined: strokes that became part of others. duplicates: strokes that
-    repeated others. lines: added between vertices. unsupported: edges left out as the images do not show them.
+    repeated others. anchored: lines hung up on edges that they meet. lines: added between vertices. unsupported: edges
+    left out as the images do not show them.
     relations: {kind: (how many were found, how many of these were imposed)}; what those imply is not imposed again.
     """
 
     circles: int = 0
     joined: int = 0
     duplicates: int = 0
+    anchored: int = 0
     lines: int = 0
     unsupported: int = 0
     relations: dict = field(default_factory=dict)
@@ -60,12 +63,13 @@ def refine_wireframe(loose, views, config):
     matching = EdgelMatching(views, config.min_views)
     strokes = [shape for shape in loose.shapes if shape.length >= LEAST_LENGTH_PX * matching.pixel]
     shapes, merging, unsupported = whole_edges(strokes, matching, config)
-    wireframe, lines = completed(connected(shapes, matching.pixel), matching)
+    anchored = anchored_lines(matching, shapes) if config.anchor else []
+    wireframe, lines = completed(connected([*shapes, *anchored], matching.pixel), matching)
     wireframe, relations = related(adjusted(wireframe, matching), matching, config.regularise)
     judged = with_evidence(wireframe, matching, config)
     unsupported += len(wireframe) - len(judged)
-    counts = RefineCounts(**asdict(merging), lines=lines, unsupported=unsupported, relations=relations)
-    return judged, counts
+    added = {"anchored": len(anchored), "lines": lines}
+    return judged, RefineCounts(**asdict(merging), **added, unsupported=unsupported, relations=relations)
 
 
 def whole_edges(shapes, matching, config):

@@ -1,0 +1,661 @@
+"""Straight edges whose depth the views cannot tell, hung up on edges whose place is known.
+
+Who walks along a façade takes its window sills from viewing planes that nearly coincide: where such an edge is in the
+images is clear, how far away it is is not. But it touches or crosses other edges, and what is known of these tells its
+depth there: each view's own straight runs of edgels that no known edge explains are given the depths of the known edges
+that they meet, the anchors. Two anchors make a line in space, further ones confirm it; a pipe in front of a cornice is
+met in the image alone, and is outvoted. Then the other views have to show the line as well, and of the lines that would
+explain the same edgels the best founded one stays.
+"""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from taichi_edges.cameras import NEAR
+from taichi_edges.edges.evidence import support_of
+from taichi_edges.kernels.device import download
+from taichi_edges.shapes import Line
+
+LINKED_PX, LINKED_BESIDE_PX, LINKED_SINE = 1.6, 0.8, 0.25  # edgels of one 2D edge: apart, to the side, turned
+BEND_PX = 0.8  # an edgel farther from the straight line through a run of them shows that it bends
+SPLITS = 12  # rounds in which bent runs are halved
+BRIDGED_PX = 12.0  # gap in a straight run where another edge crosses it
+BRIDGINGS = 6  # rounds in which pairs of parts are joined
+LEAST_LENGTH_PX = 15.0  # of a straight run
+LEAST_EDGELS = 5  # of a part of one
+BEYOND_PX = 8.0  # between the ends of edges that meet, see `junctions.REACH_PX`
+LEAST_CROSSING = 0.3  # sine of the angle in the image at which an anchor is met
+PLACE_PX, SHAPE_PX = 4.0, 1.5  # spacing of the places on runs and on shapes
+CLOSE_PX = 6.0  # where such places are so near, runs may meet shapes
+AGREEING_PX = 2.0  # from a line in space, an anchor on it
+APART_SHARE = 0.5  # of a run's length: anchors nearer to each other do not tell its slope in depth
+MOST_ANCHORS = 12  # of a run, evenly chosen
+TRIED = 3  # hypotheses of each run that are shown to the other views
+SPACING_PX = 2.0  # of the places where the views are asked
+SHOWN_PX = 1.2  # an edgel so near to the projection shows the line
+LEAST_VIEWS = 3  # that show it
+SHOWN = 0.6  # of its length in each of them
+EXPECTED = 0.5  # share of the views that show its anchors' shapes which show the line, too
+CLAIMED = 0.5  # share of its edgels that better lines explain already: it repeats them
+LEAST_VOTES, LEAST_WORTH = 2, 3.0  # views that propose a line; with how many of its ends are anchors
+OVERLAP, SAME_PX = 0.4, 3.0  # share of common edgels of two lines for one edge; px in space, up to which they agree
+ROUNDS = 3
+REPEAT_PX = 1.5  # in space, between lines that are parts of one
+
+
+def anchored_lines(matching, shapes):
+    """Lines that meet known shapes and that the views show where these say. matching: EdgelMatching. list of Line.
+
+    What is found in one round is known in the next: a pane hangs on the frame that hangs on the wall.
+    """
+    if not shapes:
+        return []
+    cameras, support = Cameras.of(matching), support_of(matching, shapes)
+    runs, known = runs_of(matching.edgels, support.claims.owners < 0), list(shapes)
+    anchors = anchors_of(runs, known, cameras, matching.pixel)
+    for _ in range(ROUNDS):
+        free = support.claims.owners < 0
+        found = distinct(shown(matching, hypotheses(runs, anchors), free, seen_in(support)), matching, free)
+        if not found:
+            break
+        anchors = anchors.joined(anchors_of(runs, found, cameras, matching.pixel), len(known))
+        known += found
+        support = support_of(matching, known)
+    return known[len(shapes) :]
+
+
+# --------------------------------------------------------------------------------------------------------- cameras
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """matrices: (V, 3, 4) point -> homogeneous pixel. centres: (V, 3). focal: (V,) px."""
+
+    matrices: np.ndarray
+    centres: np.ndarray
+    focal: np.ndarray
+
+    @staticmethod
+    def of(matching):
+        """Those of an EdgelMatching."""
+        matrices = download(matching.cameras).astype(np.float64)
+        centres = -np.linalg.solve(matrices[:, :, :3], matrices[:, :, 3:])[:, :, 0]
+        return Cameras(matrices, centres, np.sqrt(np.abs(np.linalg.det(matrices[:, :, :3]))))
+
+    def project(self, points, views):
+        """Pixels (n, 2), NaN behind the camera, and depths (n,) of points (n, 3), each in its own view (n,)."""
+        matrices = self.matrices[views]
+        homogeneous = np.einsum("nij,nj->ni", matrices[:, :, :3], points) + matrices[:, :, 3]
+        depths = homogeneous[:, 2]
+        return homogeneous[:, :2] / np.where(depths > NEAR, depths, np.nan)[:, None], depths
+
+
+# ------------------------------------------------------------------------------------------------- straight 2D runs
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Straight runs of edgels. views: (n,). ends: (n, 2, 2) px."""
+
+    views: np.ndarray
+    ends: np.ndarray
+
+    def __len__(self):
+        return len(self.views)
+
+    @property
+    def lengths(self):
+        """(n,) px."""
+        return np.linalg.norm(self.ends[:, 1] - self.ends[:, 0], axis=1)
+
+    @property
+    def along(self):
+        """(n, 2) unit vectors."""
+        return (self.ends[:, 1] - self.ends[:, 0]) / np.maximum(self.lengths, 1e-300)[:, None]
+
+    def keep(self, chosen):
+        """Only the chosen ones. chosen: (n,) bool or indices."""
+        return Runs(self.views[chosen], self.ends[chosen])
+
+
+def runs_of(edgels, free):
+    """The Runs of those Edgels that are free, (e,) bool."""
+    views, ends = [np.zeros(0, np.int64)], [np.zeros((0, 2, 2))]
+    for view in range(edgels.view_count):
+        mine = free[edgels.starts[view] : edgels.starts[view + 1]]
+        points, normals, _ = edgels.of_view(view)
+        found = straight_runs(points[mine].astype(np.float64), normals[mine].astype(np.float64))
+        views.append(np.full(len(found), view))
+        ends.append(found)
+    return Runs(np.concatenate(views), np.concatenate(ends))
+
+
+def straight_runs(points, normals):
+    """(n, 2, 2) ends, px, of the straight runs among the edgels of one view. points, normals: (m, 2)."""
+    labels = chains(points, normals)
+    points, labels = straightened(points, labels)
+    if not len(points):
+        return np.zeros((0, 2, 2))
+    moments = moments_of(points, labels)
+    ends = ends_of(points, labels, *axes_of(moments))
+    ends = bridged(ends, moments)
+    return ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) >= LEAST_LENGTH_PX]
+
+
+def chains(points, normals):
+    """(m,) labels of edgels, the same for those that follow each other on a smooth 2D edge."""
+    pairs = cKDTree(points).query_pairs(LINKED_PX, output_type="ndarray") if len(points) else np.zeros((0, 2), int)
+    first, second = pairs.T
+    way = points[second] - points[first]
+    sine = normals[first, 0] * normals[second, 1] - normals[first, 1] * normals[second, 0]
+    beside = np.maximum(np.abs((way * normals[first]).sum(axis=1)), np.abs((way * normals[second]).sum(axis=1)))
+    linked = (np.abs(sine) <= LINKED_SINE) & (beside <= LINKED_BESIDE_PX)
+    return components(len(points), first[linked], second[linked])
+
+
+def components(count, first, second):
+    """(count,) labels of the connected components of a graph with edges from `first` to `second`."""
+    graph = coo_matrix((np.ones(len(first), bool), (first, second)), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
+
+
+def straightened(points, labels):
+    """The points of straight runs and their labels, 0 .. n - 1: bent runs are cut where they are farthest off."""
+    done_points, done_labels, count = [np.zeros((0, 2))], [np.zeros(0, np.int64)], 0
+    for _ in range(SPLITS):
+        labels, sizes = np.unique(labels, return_inverse=True, return_counts=True)[1:]
+        long = (sizes >= LEAST_EDGELS)[labels]
+        points, labels = points[long], np.unique(labels[long], return_inverse=True)[1]
+        if not len(points):
+            break
+        means, axes = axes_of(moments_of(points, labels))
+        bent, pieces = halved(points, labels, means, axes)
+        straight = ~bent[labels]
+        names = np.cumsum(~bent) - 1 + count
+        done_points.append(points[straight])
+        done_labels.append(names[labels[straight]])
+        count += int((~bent).sum())
+        points, labels = points[~straight], pieces[~straight]
+    return np.concatenate(done_points), np.concatenate(done_labels)
+
+
+def halved(points, labels, means, axes):
+    """(n,) bool, whether a run bends; and (m,) labels of its halves, cut where it is farthest from its chord."""
+    way = ((points - means[labels]) * axes[labels]).sum(axis=1)
+    first, last = (farthest(sign * way, labels) for sign in (-1.0, 1.0))
+    off = off_lines(points, means[labels], axes[labels])
+    bent = off[farthest(off, labels)] > BEND_PX
+    chords = points[last] - points[first]
+    chords = chords / np.maximum(np.linalg.norm(chords, axis=1, keepdims=True), 1e-300)
+    corner = way[farthest(off_lines(points, points[first][labels], chords[labels]), labels)]
+    low, high = way[first], way[last]
+    inside = np.minimum(corner - low, high - corner) > LINKED_PX
+    cut = np.where(inside, corner, 0.5 * (low + high))
+    return bent, 2 * labels + (way > cut[labels])
+
+
+def off_lines(points, starts, along):
+    """(n,) distances of points (n, 2) from lines through (n, 2) points along (n, 2) unit vectors."""
+    offsets = points - starts
+    return np.abs(offsets[:, 0] * along[:, 1] - offsets[:, 1] * along[:, 0])
+
+
+def farthest(values, labels):
+    """(n,) index of the greatest of the values (m,) with each label."""
+    order = np.lexsort((values, labels))
+    return order[np.flatnonzero(np.diff(labels[order], append=-1))]
+
+
+def extremes(values, labels, function):
+    """(n,) np.minimum or np.maximum of the values (m,) with each label."""
+    found = np.full(labels.max(initial=-1) + 1, np.inf if function is np.minimum else -np.inf)
+    function.at(found, labels, values)
+    return found
+
+
+def moments_of(points, labels):
+    """(n, 6) count, sums of x, y, xx, xy, yy of the points with each label; those of a union are the sum."""
+    x, y = points.T
+    columns = (np.ones(len(points)), x, y, x * x, x * y, y * y)
+    return np.column_stack([np.bincount(labels, column) for column in columns])
+
+
+def axes_of(moments):
+    """(n, 2) means and (n, 2) unit vectors along the points with such moments."""
+    means = moments[:, 1:3] / moments[:, :1]
+    xx = moments[:, 3] / moments[:, 0] - means[:, 0] ** 2
+    xy = moments[:, 4] / moments[:, 0] - means[:, 0] * means[:, 1]
+    yy = moments[:, 5] / moments[:, 0] - means[:, 1] ** 2
+    angles = 0.5 * np.arctan2(2 * xy, xx - yy)
+    return means, np.column_stack([np.cos(angles), np.sin(angles)])
+
+
+def ends_of(points, labels, means, axes):
+    """(n, 2, 2) ends of the runs: their outermost points, on the line through all."""
+    way = ((points - means[labels]) * axes[labels]).sum(axis=1)
+    low, high = extremes(way, labels, np.minimum), extremes(way, labels, np.maximum)
+    return means[:, None] + np.stack([low, high], axis=1)[:, :, None] * axes[:, None]
+
+
+def bridged(ends, moments):
+    """The ends of runs, those that continue each other on one straight line joined. moments: (n, 6) of their points."""
+    for _ in range(BRIDGINGS):
+        first, second = continuing(ends)
+        if not len(first):
+            break
+        labels = np.arange(len(ends))
+        labels[second] = first
+        labels = np.unique(labels, return_inverse=True)[1]
+        moments = np.column_stack([np.bincount(labels, column) for column in moments.T])
+        ends = ends_of(ends.reshape(-1, 2), np.repeat(labels, 2), *axes_of(moments))
+    return ends
+
+
+def continuing(ends):
+    """Pairs of runs that continue each other, first and second (k,): each the other's best."""
+    places, outer = ends.reshape(-1, 2), ends[:, ::-1].reshape(-1, 2)
+    a, b = cKDTree(places).query_pairs(BRIDGED_PX, output_type="ndarray").T
+    chord = outer[b] - outer[a]
+    chord = chord / np.maximum(np.linalg.norm(chord, axis=1, keepdims=True), 1e-300)
+    off = np.maximum(*(off_lines(places[end], outer[a], chord) for end in (a, b)))
+    ahead = ((places[b] - places[a]) * chord).sum(axis=1) >= -LINKED_PX
+    good = (a // 2 != b // 2) & ahead & (off <= BEND_PX)
+    a, b = a[good] // 2, b[good] // 2
+    order = np.lexsort((b, a, off[good]))
+    a, b, rank = a[order], b[order], np.arange(len(order))
+    best = np.full(len(ends), len(order))
+    for run in (a, b):
+        np.minimum.at(best, run, rank)
+    mutual = (best[a] == rank) & (best[b] == rank)
+    return a[mutual], b[mutual]
+
+
+# --------------------------------------------------------------------------------------------------------- anchors
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Where runs meet known shapes in the image, sorted by the run.
+
+    runs, shapes: (n,) indices. points: (n, 3) on the shape, in the run's viewing plane. ways: (n,) px along the run.
+    sizes: (n,) size of a pixel there, unit-cube units.
+    """
+
+    runs: np.ndarray
+    shapes: np.ndarray
+    points: np.ndarray
+    ways: np.ndarray
+    sizes: np.ndarray
+
+    def __len__(self):
+        return len(self.runs)
+
+    def keep(self, chosen):
+        """Only the chosen ones. chosen: (n,) bool or indices."""
+        return Anchors(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    def sorted(self):
+        """The same in order of their runs, and along these."""
+        return self.keep(np.lexsort((self.ways, self.runs)))
+
+    def joined(self, other, count):
+        """These and those on further shapes, where there are `count` shapes so far."""
+        other = replace(other, shapes=other.shapes + count)
+        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+        return Anchors(*map(np.concatenate, pairs)).sorted()
+
+
+def anchors_of(runs, shapes, cameras, pixel):
+    """The Anchors of Runs on shapes. pixel: unit-cube units."""
+    pieces = pieces_of(shapes, pixel)
+    found, piece = near_pairs(runs, pieces, cameras)
+    views, starts = runs.views[found], runs.ends[found, 0]
+    middles, halves = pieces.points[piece], pieces.halves[piece]
+    lines = np.column_stack([-runs.along[found][:, 1], runs.along[found][:, 0]])
+    lines = np.column_stack([lines, -(lines * starts).sum(axis=1)])  # homogeneous: 0 on the line of the run
+    planes = np.einsum("ni,nij->nj", lines, cameras.matrices[views])
+    steep = (planes[:, :3] * halves).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        steps = -((planes[:, :3] * middles).sum(axis=1) + planes[:, 3]) / steep
+    within = np.abs(steps) <= 1.0 + 1e-6
+    found, piece, views, steps = found[within], piece[within], views[within], steps[within]
+    points = middles[within] + steps[:, None] * halves[within]
+    pixels, depths = cameras.project(points, views)
+    ahead, _ = cameras.project(points + halves[within], views)
+    ways = ((pixels - starts[within]) * runs.along[found]).sum(axis=1)
+    heading = (ahead - pixels) / np.linalg.norm(ahead - pixels, axis=1, keepdims=True)
+    sine = np.abs(heading[:, 0] * runs.along[found][:, 1] - heading[:, 1] * runs.along[found][:, 0])
+    good = (sine >= LEAST_CROSSING) & (ways >= -BEYOND_PX) & (ways <= runs.lengths[found] + BEYOND_PX)
+    anchors = Anchors(found, pieces.shapes[piece], points, ways, depths / cameras.focal[views]).keep(good)
+    return once(anchors)
+
+
+def once(anchors):
+    """The Anchors sorted by run and place along it, without those that two pieces of one shape share."""
+    order = np.lexsort((anchors.ways, anchors.shapes, anchors.runs))
+    anchors = anchors.keep(order)
+    again = (np.diff(anchors.runs) == 0) & (np.diff(anchors.shapes) == 0) & (np.diff(anchors.ways) < 1.0)
+    anchors = anchors.keep(np.append(True, ~again)[: len(anchors)])
+    return anchors.sorted()
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Short straight pieces of shapes. points: (n, 3) their middles. halves: (n, 3) from there to an end.
+
+    shapes: (n,) indices.
+    """
+
+    points: np.ndarray
+    halves: np.ndarray
+    shapes: np.ndarray
+
+
+def pieces_of(shapes, pixel):
+    """The Pieces of shapes; lines and arcs go on a little beyond their ends."""
+    points, halves, counts = [np.zeros((0, 3))], [np.zeros((0, 3))], []
+    for shape in shapes:
+        beyond = BEYOND_PX * pixel / shape.length if shape.kind in ("line", "arc") else 0.0
+        count = max(int(np.ceil(shape.length * (1 + 2 * beyond) / (SHAPE_PX * pixel))), 1)
+        joints = shape.at(np.linspace(-beyond, 1 + beyond, count + 1))
+        points.append(0.5 * (joints[1:] + joints[:-1]))
+        halves.append(0.5 * (joints[1:] - joints[:-1]))
+        counts.append(count)
+    return Pieces(np.concatenate(points), np.concatenate(halves), np.repeat(np.arange(len(shapes)), counts))
+
+
+def near_pairs(runs, pieces, cameras):
+    """(k,) runs and (k,) pieces that come close to each other in the run's view, each pair once."""
+    found, piece = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    every = np.arange(len(pieces.points))
+    for view in np.unique(runs.views):
+        mine = np.flatnonzero(runs.views == view)
+        pixels, _ = cameras.project(pieces.points, np.full(len(every), view))
+        low, high = runs.ends[mine].reshape(-1, 2).min(axis=0), runs.ends[mine].reshape(-1, 2).max(axis=0)
+        seen = every[((pixels >= low - CLOSE_PX) & (pixels <= high + CLOSE_PX)).all(axis=1)]
+        places, owners = places_on(runs, mine)
+        near = cKDTree(places).sparse_distance_matrix(cKDTree(pixels[seen]), CLOSE_PX, output_type="ndarray")
+        pairs = np.unique(owners[near["i"]] * len(every) + seen[near["j"]])
+        found.append(pairs // len(every))
+        piece.append(pairs % len(every))
+    return np.concatenate(found), np.concatenate(piece)
+
+
+def places_on(runs, chosen):
+    """(m, 2) px places on the chosen runs, some beyond their ends, and (m,) the run of each."""
+    counts = np.ceil((runs.lengths[chosen] + 2 * BEYOND_PX) / PLACE_PX).astype(np.int64) + 1
+    owners, share = np.repeat(chosen, counts), ragged(counts) / np.repeat(counts - 1, counts)
+    ways = share * (runs.lengths[owners] + 2 * BEYOND_PX) - BEYOND_PX
+    return runs.ends[owners, 0] + ways[:, None] * runs.along[owners], owners
+
+
+def ragged(counts):
+    """0 .. c - 1 for each of some counts c, one after the other."""
+    return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
+# ------------------------------------------------------------------------------------------------- lines in space
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Lines in space that are proposed for runs.
+
+    points: (n, 2, 3) two anchors that they pass through. extents: (n, 2) parameters of their ends, 0 and 1 at these.
+    shapes: (n, 2) those that these are on. views: (n,) of the runs. closed: (n,) how many ends of the run are anchors,
+    0 to 2, each the less the farther it is. sizes: (n,) of a pixel there, unit-cube units.
+    """
+
+    points: np.ndarray
+    extents: np.ndarray
+    shapes: np.ndarray
+    views: np.ndarray
+    closed: np.ndarray
+    sizes: np.ndarray
+
+    def __len__(self):
+        return len(self.points)
+
+    @property
+    def ways(self):
+        """(n, 3) from the first anchor to the second."""
+        return self.points[:, 1] - self.points[:, 0]
+
+    @property
+    def ends(self):
+        """(n, 2, 3)."""
+        return self.points[:, :1] + self.extents[:, :, None] * self.ways[:, None]
+
+    @property
+    def at_anchors(self):
+        """(n, 2) bool: is an end as near to its anchor as edges are that meet?"""
+        off = np.abs(self.extents - [0.0, 1.0]) * np.linalg.norm(self.ways, axis=1)[:, None]
+        return off <= BEYOND_PX * self.sizes[:, None]
+
+    @property
+    def lengths(self):
+        """(n,) unit-cube units."""
+        return (self.extents[:, 1] - self.extents[:, 0]) * np.linalg.norm(self.ways, axis=1)
+
+    def keep(self, chosen):
+        """Only the chosen ones. chosen: (n,) bool or indices."""
+        return Lines(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    @staticmethod
+    def joined(several):
+        """All of some Lines."""
+        counts = np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
+        nothing = Lines(np.zeros((0, 2, 3)), np.zeros((0, 2)), *counts, *np.zeros((2, 0)))
+        columns = ([getattr(lines, field.name) for lines in (nothing, *several)] for field in fields(Lines))
+        return Lines(*map(np.concatenate, columns))
+
+
+def hypotheses(runs, anchors):
+    """The Lines through pairs of anchors of Runs with which most others agree, at most TRIED for each run."""
+    counts = np.bincount(anchors.runs, minlength=len(runs))
+    starts, several = np.cumsum(counts) - counts, []
+    for count in range(2, MOST_ANCHORS + 1):
+        chosen = np.flatnonzero(counts == count if count < MOST_ANCHORS else counts >= count)
+        share = np.arange(count) / (count - 1)
+        rows = starts[chosen, None] + np.round(share * (counts[chosen, None] - 1)).astype(np.int64)
+        several += proposed(runs.keep(chosen), anchors.keep(rows))
+    return Lines.joined(several)
+
+
+def proposed(runs, anchors):
+    """Lists of Lines for r Runs with c anchors each. anchors: Anchors with arrays (r, c, ..)."""
+    lengths, points, ways, sizes = runs.lengths, anchors.points, anchors.ways, anchors.sizes
+    first, second = np.triu_indices(points.shape[1], 1)
+    agree = on_lines(points, first, second, sizes)  # (r, p, c)
+    far = ways[:, second] - ways[:, first]
+    enough = far >= APART_SHARE * lengths[:, None]
+    worth = np.where(enough, agree.sum(axis=2) + 0.25 * np.minimum(far / lengths[:, None], 2.0), 0.0)
+    found, rows = [], np.arange(len(lengths))
+    for _ in range(TRIED):
+        best = worth.argmax(axis=1) if len(rows) else np.zeros(0, np.int64)
+        mine, pair = rows[worth[rows, best] > 0], best[worth[rows, best] > 0]
+        ends = np.column_stack([first[pair], second[pair]])
+        chosen = (mine[:, None], ends)
+        extents, usable = extents_of(lengths[mine], ways[chosen], sizes[chosen])
+        gaps = np.abs(ways[chosen] - np.stack([np.zeros(len(mine)), lengths[mine]], axis=1))
+        closed = np.maximum(1.0 - gaps / BEYOND_PX, 0.0).sum(axis=1)
+        of = anchors.shapes[chosen], runs.views[mine], closed, sizes[chosen].mean(axis=1)
+        found.append(Lines(points[chosen], extents, *of).keep(usable))
+        implied = ~(agree & ~agree[rows, best][:, None]).any(axis=2)  # nothing agrees that does not with the best
+        worth = np.where(implied, 0.0, worth)
+    return found
+
+
+def on_lines(points, first, second, sizes):
+    """(r, p, c) bool: do anchors, (r, c, 3), lie on the lines through pairs of them? sizes: (r, c) of a pixel."""
+    start, way = points[:, first], points[:, second] - points[:, first]
+    way = way / np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-300)
+    offsets = points[:, None] - start[:, :, None]
+    offsets = offsets - np.einsum("rpck,rpk->rpc", offsets, way)[..., None] * way[:, :, None]
+    return np.linalg.norm(offsets, axis=3) <= AGREEING_PX * sizes[:, None]
+
+
+def extents_of(lengths, ways, sizes):
+    """(r, 2) parameters of the ends of runs on lines in space, and (r,) bool, whether they are in front of the camera.
+
+    lengths: (r,) px. ways: (r, 2) px along the run of the places with parameter 0 and 1. sizes: (r, 2) of a pixel
+    there, which are as their depths. A line's places in the image are a projective function of those in space.
+    """
+    ends = np.stack([np.zeros(len(lengths)), lengths], axis=1)
+    near = (ends - ways[:, :1]) * sizes[:, :1]
+    below = near + (ways[:, 1:] - ends) * sizes[:, 1:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        extents = near / below
+    return extents, (below > 0).all(axis=1) & (extents[:, 1] > extents[:, 0])
+
+
+# -------------------------------------------------------------------------------------------- what the views show
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What the views show at places along some Lines.
+
+    lines: (m,) index of the line. parameters: (m,). edgels: (m, V) index, -1 none that is free. seen: (m, V) bool,
+    whether the place is in the image.
+    """
+
+    lines: np.ndarray
+    parameters: np.ndarray
+    edgels: np.ndarray
+    seen: np.ndarray
+
+    @staticmethod
+    def of(matching, lines, free, spacing):
+        """spacing: px. free: (e,) bool, the edgels that count."""
+        counts = np.maximum(np.round(lines.lengths / (spacing * lines.sizes)), 4).astype(np.int64)
+        owners = np.repeat(np.arange(len(lines)), counts)
+        share = (ragged(counts) + 0.5) / counts[owners]
+        parameters = lines.extents[owners, 0] + share * np.diff(lines.extents, axis=1)[owners, 0]
+        way = lines.ways[owners]
+        points = lines.points[owners, 0] + parameters[:, None] * way
+        way = way / np.linalg.norm(way, axis=1, keepdims=True)
+        edgels, _, seen = matching.matches(points, way, slice(0, matching.edgels.view_count), SHOWN_PX)
+        return Sight(owners, parameters, np.where(np.append(free, False)[edgels], edgels, -1), seen)
+
+    def shares(self, count):
+        """(L, V) share of the places of each of the lines that a view has and shows; of them all."""
+        total = np.bincount(self.lines, minlength=count)[:, None]
+        shown = [np.bincount(self.lines, column, count) for column in (self.edgels >= 0).T]
+        return np.stack(shown, axis=1) / np.maximum(total, 1)
+
+
+def seen_in(support):
+    """(S, V) bool: does a view show a shape, on half of its length? support: Support of the shapes."""
+    lengths = support.samples.lengths[:, None]
+    return support.samples.sums(lengths * (support.edgels >= 0)) >= 0.5 * support.samples.sums(lengths)
+
+
+def shown(matching, lines, free, seen):
+    """The Lines that enough views show, cut to where they do. free: (e,) bool, the edgels that no known shape has.
+
+    seen: (S, V) bool, which views show which shapes. A view that shows both shapes on which a line is anchored should
+    show it, too; where it has the depth of something in front of it, neighbouring views do and others do not.
+    """
+    sight = Sight.of(matching, lines, free, SPACING_PX)
+    enough = (sight.edgels >= 0).sum(axis=1) >= LEAST_VIEWS
+    lines, kept = clipped(lines, sight, enough)
+    lines = lines.keep(kept)
+    sight = Sight.of(matching, lines, free, SPACING_PX)
+    views = sight.shares(len(lines)) >= SHOWN
+    expected = seen[lines.shapes].all(axis=1)
+    agreed = (views & expected).sum(axis=1) >= EXPECTED * expected.sum(axis=1)
+    return lines.keep(agreed & (views.sum(axis=1) >= LEAST_VIEWS))
+
+
+def clipped(lines, sight, enough):
+    """The Lines cut to where most places are shown by enough views, (m,) bool, and (n,) bool, whether that is a line.
+
+    Of all stretches the one with the greatest surplus of places that are shown over SHOWN of them.
+    """
+    gain, extents = np.where(enough, 1.0 - SHOWN, -SHOWN), lines.extents.copy()
+    starts = np.searchsorted(sight.lines, np.arange(len(lines) + 1))
+    for line in np.unique(sight.lines[enough]):
+        part = slice(starts[line], starts[line + 1])
+        total = np.concatenate([[0.0], np.cumsum(gain[part])])
+        lowest = np.minimum.accumulate(total)
+        last = int(np.argmax(total - lowest))
+        first = int(np.argmin(total[: last + 1]))
+        step = (lines.extents[line, 1] - lines.extents[line, 0]) / (part.stop - part.start)
+        extents[line] = lines.extents[line, 0] + step * np.array([first, last])
+    shown = np.bincount(sight.lines, enough, len(lines)) > 0
+    lines = replace(lines, extents=extents)
+    lines = replace(lines, extents=np.where(lines.at_anchors, [0.0, 1.0], extents))
+    return lines, shown & (lines.lengths >= LEAST_LENGTH_PX * lines.sizes)
+
+
+# ------------------------------------------------------------------------------------------------- each edge once
+
+
+def distinct(lines, matching, free):
+    """A list of Line that several views propose. Each edgel is on one, the best founded one, which its repeats extend.
+
+    free: (e,) bool, the edgels that no known shape has.
+    """
+    sight = Sight.of(matching, lines, free, 0.5 * SPACING_PX)
+    votes, worth, rival = ballot(lines, sight, len(free))
+    elected = (votes >= LEAST_VOTES) & (worth >= LEAST_WORTH) & (worth >= rival)
+    support = np.bincount(sight.lines, (sight.edgels >= 0).sum(axis=1), len(lines))
+    starts = np.searchsorted(sight.lines, np.arange(len(lines) + 1))
+    owners, extents, kept = np.full(len(free), -1), lines.extents.copy(), []
+    for line in np.lexsort((-support, -worth)).tolist():
+        found = np.unique(sight.edgels[starts[line] : starts[line + 1]])
+        found = found[found >= 0]
+        others = owners[found]
+        if (others >= 0).mean() < CLAIMED:
+            if elected[line]:
+                kept.append(line)
+                owners[found[others < 0]] = line
+            continue
+        best = int(np.bincount(others[others >= 0]).argmax())
+        along, apart = beside(lines, np.array([best]), lines.ends[line][None])
+        if apart[0] <= REPEAT_PX * lines.sizes[best]:
+            extents[best] = min(extents[best, 0], along.min()), max(extents[best, 1], along.max())
+            owners[found[others < 0]] = best
+    ends = replace(lines, extents=extents).ends
+    return [Line(ends[line]) for line in sorted(kept)]
+
+
+def ballot(lines, sight, count):
+    """(n,) number of views whose runs propose a line, (n,) that and how many of their ends are anchors, on average, and
+    (n,) the greatest such sum of the other lines for the same edgels.
+
+    Which known edges a run happens to cross in the image changes with the viewpoint, and so does where a line through
+    these would be; what it really touches does not. And edges end where they meet others, in every view. sight: of the
+    Lines. count: of edgels.
+    """
+    place, view = np.nonzero(sight.edgels >= 0)
+    shape, entries = (len(lines), count), np.ones(len(place), np.int32)
+    owned = csr_matrix((entries, (sight.lines[place], sight.edgels[place, view])), shape=shape)
+    owned.data[:] = 1
+    total, common = np.asarray(owned.sum(axis=1))[:, 0], (owned @ owned.T).tocoo()
+    alike = common.data >= OVERLAP * np.minimum(total[common.row], total[common.col])
+    one, other = common.row[alike], common.col[alike]
+    same = beside(lines, one, lines.ends[other])[1] <= SAME_PX * lines.sizes[one]
+    votes = voters(one[same], lines.views[other[same]], len(lines))
+    closed = np.bincount(one[same], lines.closed[other[same]], len(lines))
+    worth, rival = votes + closed / np.maximum(np.bincount(one[same], minlength=len(lines)), 1), np.zeros(len(lines))
+    np.maximum.at(rival, one[~same], worth[other[~same]])
+    return votes, worth, rival
+
+
+def voters(lines, views, count):
+    """(count,) number of different views that are paired with each of the lines."""
+    pairs = np.unique(np.column_stack([lines, views]), axis=0)
+    return np.bincount(pairs[:, 0], minlength=count)
+
+
+def beside(lines, chosen, points):
+    """(k, m) parameters on chosen Lines, (k,), of points (k, m, 3), and (k,) how far these are from them at most."""
+    way, offsets = lines.ways[chosen][:, None], points - lines.points[chosen, :1]
+    along = (offsets * way).sum(axis=2) / (way**2).sum(axis=2)
+    return along, np.linalg.norm(offsets - along[:, :, None] * way, axis=2).max(axis=1)
