@@ -36,7 +36,7 @@ CANDIDATES = 4  # depths kept for each reference
 TOGETHER = 3  # neighbours that must agree
 NEARBY_PX, ACROSS_PX = 8.0, 1.5  # candidates on the same line, along it and across
 ALIGNED = np.cos(np.radians(30.0))  # and so much in the same direction: a bin is 15 degrees wide
-LEAST_COMPANIONS = 2
+LEAST_COMPANIONS = 4
 LEAST_VIEWS, LEAST_SUPPORT = 2.0, 0.1  # of full strength, and their share of those that have a seed in the image
 SEARCHED = 20_000  # candidates whose companions are looked for at the same time
 THINNED_PX = 3.0  # one seed in each cell of this size
@@ -293,12 +293,10 @@ def swept_gaussians(views, count, opacity, generator, progress):
     """
     with progress.track("sweep", len(views)) as report:
         seeds = sweep_seeds(views, report)
-    good = seeds.companions >= LEAST_COMPANIONS
-    found = refine_points(EdgelMatching(views), seeds.points[good], seeds.directions[good])
-    found = found.keep((found.views >= LEAST_VIEWS) & (found.support >= LEAST_SUPPORT))
-    order = np.argsort(-found.views, kind="stable")
+    good = np.flatnonzero(seeds.companions >= LEAST_COMPANIONS)
+    order = good[np.argsort(-seeds.companions[good], kind="stable")]
     pixel = pixel_size(views)
-    cells = np.floor(found.points[order] / (THINNED_PX * pixel)).astype(np.int64)
+    cells = np.floor(seeds.points[order] / (THINNED_PX * pixel)).astype(np.int64)
     chosen = np.sort(order[np.unique(cells, axis=0, return_index=True)[1]])  # the best of each cell
     if len(chosen) > count:
         chosen = np.sort(generator.choice(chosen, count, replace=False))
