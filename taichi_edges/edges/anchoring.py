@@ -43,7 +43,7 @@ EXPECTED = 0.5  # share of the views that show its anchors' shapes which show th
 CLAIMED = 0.5  # share of its edgels that better lines explain already: it repeats them
 LEAST_VOTES, LEAST_WORTH = 2, 3.0  # views that propose a line; with how many of its ends are anchors
 OVERLAP, SAME_PX = 0.4, 3.0  # share of common edgels of two lines for one edge; px in space, up to which they agree
-ROUNDS = 3
+ROUNDS = 3  # in which lines carry further ones
 REPEAT_PX = 1.5  # in space, between lines that are parts of one
 
 
@@ -57,14 +57,14 @@ def anchored_lines(matching, shapes):
     cameras, support = Cameras.of(matching), support_of(matching, shapes)
     runs, known = runs_of(matching.edgels, support.claims.owners < 0), list(shapes)
     anchors = anchors_of(runs, known, cameras, matching.pixel)
-    for _ in range(ROUNDS):
+    for number in range(ROUNDS):
+        support = support_of(matching, known) if number else support
         free = support.claims.owners < 0
         found = distinct(shown(matching, hypotheses(runs, anchors), free, seen_in(support)), matching, free)
         if not found:
             break
         anchors = anchors.joined(anchors_of(runs, found, cameras, matching.pixel), len(known))
         known += found
-        support = support_of(matching, known)
     return known[len(shapes) :]
 
 
