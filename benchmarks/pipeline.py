@@ -20,6 +20,7 @@ if not __package__:  # run as a script: the project's root takes the place of th
 
 from benchmarks.machine import available_threads, benchmark_cache, compiled_kernels, machine_line, maxrss_mib
 from benchmarks.markdown import table
+from taichi_edges.command import with_reader
 from taichi_edges.errors import UserError
 from taichi_edges.pipeline import STAGES, Run
 from taichi_edges.scene_file import load_scene
@@ -30,6 +31,18 @@ METRICS = {
     "Comp mm": ("completeness_mm", "{:.2f}"),
     "F5 %": ("f_score_5mm_percent", "{:.1f}"),
     "F10 %": ("f_score_10mm_percent", "{:.1f}"),
+}
+HELD_OUT = {
+    "views held out": ("held_out_views", "{:d}"),
+    "precision %": ("held_out_precision_percent", "{:.1f}"),
+    "by chance %": ("held_out_chance_percent", "{:.1f}"),
+    "judged %": ("held_out_judged_percent", "{:.1f}"),
+    "recall %": ("held_out_recall_percent", "{:.1f}"),
+    "recall of long edges %": ("held_out_recall_long_percent", "{:.1f}"),
+    "F %": ("held_out_f_score_percent", "{:.1f}"),
+    "median px": ("held_out_residual_median_px", "{:.2f}"),
+    "p90 px": ("held_out_residual_p90_px", "{:.2f}"),
+    "edges": ("edges", "{:d}"),
 }
 
 
@@ -52,6 +65,7 @@ def missing_data(scene, data_root):
     """Why a scene cannot run here, or None."""
     try:
         run = Run(load_scene(str(scene), None, [], None), Path("nowhere"), data_root)
+        run = with_reader(run) if run.config.source.reader == "auto" else run
         for stage in STAGES.values():
             stage.outside(run)
     except UserError as error:
@@ -116,12 +130,21 @@ def memory_row(runs):
 
 
 def metrics_row(runs):
-    """What the runs found; they are alike, because the seed is."""
+    """What the runs found, against the ground truth; they are alike, because the seed is."""
     metrics = runs[0].metrics
     if metrics["ground_truth"] is None:
         return [None] * (len(METRICS) + 1)
-    found = [pattern.format(metrics[key]) if metrics[key] is not None else None for key, pattern in METRICS.values()]
-    return [*found, f"{metrics['edges']} ({metrics['true_edges']})"]
+    return [*_cells(metrics, METRICS), f"{metrics['edges']} ({metrics['true_edges']})"]
+
+
+def held_out_row(runs):
+    """What the views say that were held out, whether there is a ground truth or not."""
+    return _cells(runs[0].metrics, HELD_OUT)
+
+
+def _cells(metrics, columns):
+    """The text of some metrics, None where there is no number. columns: {heading: (key, pattern)}."""
+    return [pattern.format(metrics[key]) if metrics[key] is not None else None for key, pattern in columns.values()]
 
 
 def median(values):
@@ -161,6 +184,8 @@ def main(arguments=None):
     print(table([*heads, *STAGES], [[*key, *memory_row(runs)] for key, runs in found.items()]))
     print("\nWhat they found:\n")
     print(table([*heads, *METRICS, "edges (true)"], [[*key, *metrics_row(runs)] for key, runs in found.items()]))
+    print("\nWhat views that were held out say of it (docs/metrics.md):\n")
+    print(table([*heads, *HELD_OUT], [[*key, *held_out_row(runs)] for key, runs in found.items()]))
     for scene, reason in skipped.items():
         if reason:
             print(f"\nSkipped {scene.stem}: {reason}")

@@ -1,9 +1,10 @@
-"""COLMAP models and lenses: the one module that knows pycolmap (4 or later).
+"""COLMAP models, lenses and structure from motion: the one module that knows pycolmap (4 or later).
 
 COLMAP puts the centre of the top-left pixel at (0.5, 0.5); what leaves this module has it at (0, 0), see `cameras`.
 """
 
 import functools
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +16,21 @@ from taichi_edges.errors import UserError, did_you_mean
 HALF_PIXEL = 0.5  # between COLMAP's pixel coordinates and ours
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")  # the last two from COLMAP 3.12 on
 NEEDED_FILES = MODEL_FILES[:3]
+LAST_PAIRED = 80  # images; of more, not every pair is matched
+NEIGHBOURS = 10  # images after each, in the order of their names, with which it is then matched; and 2^i farther ones
+FEATURE_SIZE = 2000  # px of the longest side, to which images are shrunk for it: 24 megapixels take 2 GiB and 30 s each
+RICH = 10  # images of one camera from which on they determine tangential distortion, too
+SMALLEST_MODEL = 3  # images
+PAIRS_AT_ONCE = 40  # matched between two reports
 MODEL_SUFFIXES = (".bin", ".txt")  # in the order in which COLMAP looks for them
+
+
+def _colmap():
+    """pycolmap, silent: what it would log comes as an exception as well, or is no concern of the user's."""
+    import pycolmap
+
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
+    return pycolmap
 
 
 @dataclass(frozen=True)
@@ -32,8 +47,7 @@ class Lens:
 
     def camera(self):
         """The pycolmap Camera; UserError where there is no such model, or it has other parameters."""
-        import pycolmap
-
+        pycolmap = _colmap()
         names = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
         if self.model not in names:
             raise UserError(f"COLMAP has no camera model {self.model}{did_you_mean(self.model, names)}")
@@ -89,8 +103,7 @@ def read_reconstruction(folder):
 
 @functools.lru_cache(maxsize=8)
 def _reconstruction_of(folder, _states):
-    import pycolmap
-
+    pycolmap = _colmap()
     try:
         model = pycolmap.Reconstruction(str(folder))
         _refuse_cut_cameras(folder / "cameras.bin", model)
@@ -136,8 +149,7 @@ def undistorted(lens):
     As large as the lens's picture or a little smaller, so that (nearly) no pixel of it is empty. Pixel centres at
     integers.
     """
-    import pycolmap
-
+    pycolmap = _colmap()
     camera = lens.camera()
     if not lens.is_pinhole:
         camera = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
@@ -149,3 +161,120 @@ def undistorted(lens):
 def distorted_pixels(lens, rays):
     """(n, 2) pixels, centres at integers, at which a lens shows (n, 3) camera directions; NaN where it cannot."""
     return lens.camera().img_from_cam(np.ascontiguousarray(rays, dtype=np.float64)) - HALF_PIXEL
+
+
+def reconstruct(images, names, groups, folder, seed, threads, progress, masks=None):
+    """Structure from motion on the CPU; the COLMAP model with the most images is written to `folder`/sparse.
+
+    images: the folder of the images. names: (V,) relative paths. groups: lists of names that share a camera.
+    masks: a folder of PNG files named `<name>.png`, 0 where features do not count; None without.
+    The same seed gives the same model, whatever the number of threads. Returns the names of the registered images,
+    [] where there is no model.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    database = folder / "database.db"
+    database.unlink(missing_ok=True)
+    try:
+        _extract(database, images, names, groups, masks, threads, progress)
+        numbers = _numbered(database)
+        _match(database, folder / "pairs.txt", [numbers[name] for name in names], seed, threads, progress)
+        model = _map(database, images, folder / "models", len(names), seed, progress)
+    except (ValueError, RuntimeError) as error:
+        raise UserError(f"{images}: structure from motion failed ({error}); see whether all images open") from error
+    if model is None:
+        return []
+    named = {number: name for name, number in numbers.items()}
+    for image in model.images.values():
+        image.name = named[image.name]
+    (folder / "sparse").mkdir(exist_ok=True)
+    model.write(str(folder / "sparse"))
+    database.unlink()  # a megabyte for each image
+    shutil.rmtree(folder / "models")
+    return sorted(image.name for image in model.images.values() if image.has_pose)
+
+
+def _extract(database, images, names, groups, masks, threads, progress):
+    """Cameras, in the order of the groups, then features, some images at a time."""
+    pycolmap = _colmap()
+    pycolmap.Database.open(str(database)).close()
+    for group in groups:
+        reader = pycolmap.ImageReaderOptions(camera_model="OPENCV" if len(group) >= RICH else "SIMPLE_RADIAL")
+        pycolmap.import_images(str(database), str(images), pycolmap.CameraMode.SINGLE, group, reader)
+    options = pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False, max_image_size=FEATURE_SIZE)
+    reader = pycolmap.ImageReaderOptions(mask_path=str(masks)) if masks else pycolmap.ImageReaderOptions()
+    single, device = pycolmap.CameraMode.SINGLE, pycolmap.Device.cpu  # images keep the cameras that they have
+    with progress.track("find features", len(names)) as report:
+        for start in range(0, len(names), threads):
+            some = names[start : start + threads]
+            pycolmap.extract_features(str(database), str(images), some, single, reader, options, device)
+            report(min(start + threads, len(names)))
+
+
+def _numbered(database):
+    """Give the images of a database numbers for names: a list of pairs knows no blanks. Returns {name: number}."""
+    numbers = {}
+    with _colmap().Database.open(str(database)) as opened:
+        for image in opened.read_all_images():
+            numbers[image.name] = f"{image.image_id:06d}"
+            image.name = numbers[image.name]
+            opened.update_image(image)
+    return numbers
+
+
+def _match(database, listing, names, seed, threads, progress):
+    """Features of pairs of images, some pairs at a time."""
+    pycolmap = _colmap()
+    pairs = image_pairs(names)
+    options = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    with progress.track("match features", len(pairs)) as report:
+        for start in range(0, len(pairs), PAIRS_AT_ONCE):
+            some = pairs[start : start + PAIRS_AT_ONCE]
+            listing.write_text("".join(f"{first} {second}\n" for first, second in some), encoding="utf-8")
+            pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listing))
+            pycolmap.match_image_pairs(str(database), options, pairing, verification, pycolmap.Device.cpu)
+            report(min(start + PAIRS_AT_ONCE, len(pairs)))
+    listing.unlink()
+
+
+def image_pairs(names):
+    """The pairs to match: all of up to LAST_PAIRED images; of more, each with those that follow, near and far."""
+    count = len(names)
+    steps = range(1, count)
+    if count > LAST_PAIRED:
+        steps = sorted({*range(1, NEIGHBOURS + 1), *(1 << power for power in range(count.bit_length()))})
+    return [(names[i], names[i + step]) for i in range(count) for step in steps if i + step < count]
+
+
+def _map(database, images, folder, count, seed, progress):
+    """The pycolmap Reconstruction with the most images, None without one."""
+    pycolmap = _colmap()
+    pycolmap.set_random_seed(seed)
+    options = pycolmap.IncrementalPipelineOptions(
+        # More threads add up the residuals in an order that nobody knows.
+        num_threads=1,
+        random_seed=seed,
+        min_model_size=SMALLEST_MODEL,
+        extract_colors=False,
+    )
+    options.mapper.num_threads = 1
+    options.mapper.random_seed = options.triangulation.random_seed = seed
+    folder.mkdir(exist_ok=True)
+    done = [0]
+
+    def another(registered):
+        done[0] = min(done[0] + registered, count)
+        report(done[0], f"{done[0]} images placed")
+
+    with progress.track("place cameras", count) as report:
+        models = pycolmap.incremental_mapping(
+            str(database), str(images), str(folder), options, "", lambda: another(2), lambda: another(1)
+        )
+    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+
+
+def known_focal_length(path):
+    """Focal length in pixels that an image's EXIF tells, None where it tells none."""
+    camera = _colmap().infer_camera_from_image(str(path))
+    return camera.mean_focal_length() if camera.has_prior_focal_length else None

@@ -25,7 +25,7 @@ Point = Annotated[list[float], Field(min_length=3, max_length=3)]
 Box = Annotated[list[Point], Field(min_length=2, max_length=2)]
 
 
-WITH_POINTS = ("colmap", "images", "nerfstudio")  # readers of layouts that may hold points of their own
+WITH_POINTS = ("auto", "colmap", "images", "nerfstudio")  # readers of layouts that may hold points of their own
 MOST_BIAS = 20.0  # px; a map that is farther off belongs to another image
 
 
@@ -158,7 +158,7 @@ class TrainConfig(Section):
     seeds: Literal["auto", "random", "points", "votes"] = Field(
         "auto",
         description="random points in the box; points: source.points or the model's; votes: where many views agree on"
-        " an edge; auto: points if there are any, else random",
+        " an edge; auto: points as far as there are any, else random",
     )
     initial_scale: Positive = Field(0.004, description="standard deviation, unit-cube units")
     initial_opacity: Annotated[float, Field(gt=0, lt=1)] = Field(0.08)
@@ -257,13 +257,33 @@ def _is_held_out(value):
     return bool(names) or (type(value) is int and value > 0)
 
 
+class ScanConfig(Section):
+    """Which points of a scan are on edges, see evaluation/pseudo_truth.py."""
+
+    edges: str = Field("", description="folder of ready edge maps to judge by, like source.edges; '': the scene's own")
+    threshold: Share = Field(0.5, description="of full scale, that an edge pixel of those maps exceeds")
+    share: Share = Field(0.5, description="of the views that see a point, in more than which it is on an edge")
+    views: Count = Field(3, description="that see a point, at least")
+
+
 class EvaluationConfig(Section):
     """Ground truth, where there is one, and views that only the evaluation sees."""
 
     truth: str = Field("", description="ABC folder, PLY or edge JSON, relative to the data root; '': there is none")
+    kind: Literal["edges", "scan"] = Field(
+        "edges",
+        description="what truth holds: edges, or the points of a scanned surface, those on edges being the truth",
+    )
+    scan: ScanConfig = ScanConfig()
     held_out: Annotated[str | int | list[str], _measured_or(_is_held_out, "a number, or a list of names, of views")] = (
         Field("auto", description="views kept for the evaluation: their number or names; auto: one in ten, at most 3")
     )
+
+    @model_validator(mode="after")
+    def _scan_is_there(self):
+        if self.kind == "scan" and not self.truth.lower().endswith(".ply"):
+            raise ValueError("kind is 'scan', so truth must name the PLY with the points of the scan")
+        return self
 
 
 class SceneConfig(Section):

@@ -118,7 +118,8 @@ def _file_content(path):
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
-        raise UserError(f"{path}: is not a text file; a scene is a YAML file, see scenes/") from error
+        what = "a scene is a YAML file, see scenes/, or a folder of photographs"
+        raise UserError(f"{path}: is not a text file; {what}") from error
     except OSError as error:
         raise UserError(f"{path}: {_why_unreadable(path, error)}") from error
     content = parse_yaml(text, path)

@@ -26,6 +26,7 @@ from taichi_edges.wireframe import read_wireframe, write_wireframe
 
 WIDEST_PX = 40.0  # of a detector's lines
 UNIT_CUBE = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+WRONG_CAMERAS = "poses or intrinsics may not be those of these images (their order, axes or scale)"
 CALIBRATION_SEEDS = 4000  # 3D points through which a detector's biases are measured, at most
 
 
@@ -38,35 +39,42 @@ def prepare(run):
         return _prepare_synthetic(run)
     from taichi_edges.detectors import DETECTORS, choose_detector
     from taichi_edges.readers.frames import build_views, camera_poses, chosen_frames
-    from taichi_edges.readers.undistortion import undistorted_frames
 
     source = run.config.source
-    frames = _listed_frames(run)
+    frames = _posed_frames(run, chosen_frames(_listed_frames(run), source.skip))
     _pass_on(frames, run.progress)
-    frames = chosen_frames(frames, source.skip)
     camera_poses(frames)  # a mistake in them shall not wait for the detector
-    box, box_from = _scene_box(run.config, frames)
+    box, box_from = _scene_box(run, frames)
     _refuse_missing_points(run, frames)
+    frames = _checked(run, frames, box, guessed=box_from == "reader")
     detector = choose_detector(source, frames)
     _refuse_needless_calibration(run, detector)
-    frames = undistorted_frames(
-        frames, run.path("undistorted"), source.max_size, source.gamma, run.threads, run.progress
-    )
+    frames = _undistorted(run, frames)
     frames, edge_maps, edgels = DETECTORS[detector](frames, run)
     views = _inside_the_run(run, build_views(frames, edge_maps, edgels, source, box, run.progress))
-    facts = _finish_views(run, views, frames)
+    facts = {"detector": detector, "box": np.array(box).tolist(), "box_from": box_from}
+    facts |= _finish_views(run, views, frames)
     own = [path for path in views.image_paths if path and not Path(path).is_absolute()]
-    points = _write_points(run, frames, box)
-    about_box = {"box": np.asarray(box, dtype=float).tolist(), "box_from": box_from}
-    return {"detector": detector, **about_box, **facts, "files": [*own, *facts["files"], *points]}
+    return {**facts, "files": [*own, *facts["files"], *_write_points(run, frames, box)]}
 
 
-def _listed_frames(run):
-    """What the reader found."""
+def _listed_frames(run, **changed):
+    """What the reader found. changed: keys of the scene's source that are to be read otherwise."""
     from taichi_edges.readers import READERS
 
-    source = run.config.source
+    source = run.config.source.model_copy(update=changed)
     return READERS[source.reader](run.data_path(source.path, "source.path"), source)
+
+
+def _posed_frames(run, frames):
+    """The frames themselves; photographs without poses after structure from motion."""
+    source = run.config.source
+    if source.reader != "images":
+        return frames
+    from taichi_edges.readers.photos import posed_photos
+
+    folder = run.data_path(source.path, "source.path")
+    return posed_photos(frames, folder, source, run.path("sfm"), run.config.seed, run.threads, run.progress)
 
 
 def _pass_on(frames, progress):
@@ -77,16 +85,41 @@ def _pass_on(frames, progress):
         progress.warn(warning)
 
 
-def _scene_box(config, frames):
+def _scene_box(run, frames):
     """(2, 3) corners of the scene, input units, and where they are from."""
-    if config.box != "auto":
-        return config.box, "scene"
+    if run.config.box != "auto":
+        return run.config.box, "scene"
     if frames.box is not None:
+        corners = " to ".join("(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in frames.box)
+        run.progress.say(
+            f"scene box {corners}, in units of the cameras, as the layout has it; the key box sets another"
+        )
         return frames.box, "reader"
     if frames.points is not None:
         found = f"{len(frames.points)} points fit well enough to tell where the scene is"
         raise UserError(f"{frames.where}: only {found}; set box, or raise source.max_point_error")
     return UNIT_CUBE, "unit cube"
+
+
+def _checked(run, frames, box, guessed):
+    """The frames, whose cameras and box can be those of one scene; without those that do not see a guessed box."""
+    from taichi_edges.readers.frames import check_before_detection, frames_in_sight
+    from taichi_edges.readers.images import refuse_copies
+
+    source = run.config.source
+    if guessed:
+        frames = frames_in_sight(frames, source, box, run.progress)
+    check_before_detection(frames, source, box)
+    refuse_copies(frames, run.progress)
+    return frames
+
+
+def _undistorted(run, frames):
+    """The frames as pinhole cameras would have taken them, their pictures in the run's folder."""
+    from taichi_edges.readers.undistortion import undistorted_frames
+
+    source, folder = run.config.source, run.path("undistorted")
+    return undistorted_frames(frames, folder, source.max_size, source.gamma, run.threads, run.progress)
 
 
 def _refuse_missing_points(run, frames):
@@ -138,8 +171,8 @@ def _finish_views(run, views, frames=None):
     facts = {"views": len(views), "held_out": list(held_out.names), **facts}
     if traced_here:
         views, calibration = _calibrated(run, views)
+        held_out = _corrected(run, held_out, calibration)
         if calibration is not None:
-            held_out = _corrected(run, held_out, calibration)
             facts["calibration"] = calibration.facts()
             residuals = {"residuals": calibration.residuals, "on_silhouette": calibration.on_silhouette}
     facts["edgels"] = len(views.edgels)
@@ -239,15 +272,19 @@ def _calibrate(run, views, thin):
 
 
 def _corrected(run, views, calibration):
-    """Views that the calibration has not seen, their edgels without the biases that it found in others."""
+    """Held-out views, their edgels without the biases that the Calibration, None for none, has found in the others."""
     from taichi_edges.detectors.calibration import sides_of
+    from taichi_edges.detectors.drawing import draw_edge_maps
 
-    if not len(views) or not (calibration.shift_applied or calibration.silhouette_applied):
+    edgels = views.edgels
+    if not len(views):
         return views
-    silhouette, shift = calibration.silhouette_applied * calibration.silhouette, calibration.shift
-    values = np.array([silhouette, *(calibration.shift_applied * shift)])
-    sides = sides_of(with_whole_paths(run, views), views.edgels, run.threads)
-    return replace(views, edgels=sides.correct(views.edgels, values)[0])
+    if calibration is not None and len(edgels):
+        silhouette = calibration.silhouette_applied * calibration.silhouette
+        values = np.array([silhouette, *(calibration.shift_applied * calibration.shift)])
+        edgels = sides_of(with_whole_paths(run, views), edgels, run.threads).correct(edgels, values)[0]
+    maps = draw_edge_maps(edgels, views.height, views.width, run.threads) if run.config.source.thin else views.edge_maps
+    return replace(views, edgels=edgels, edge_maps=maps)
 
 
 def _write_sheet(run, views, residuals):
@@ -350,12 +387,15 @@ def _start(run, views, generator):
         seeds = "points" if run.path("seeds.ply").is_file() else "random"
         instead = {"points": "the given points", "random": "random points"}[seeds]
         found = f"the views agree on an edge in fewer than {LEAST_VOTED} places"
-        run.progress.warn(f"{found}; the training starts from {instead} instead")
-    if seeds == "points" or (seeds == "auto" and run.path("seeds.ply").is_file()):
+        run.progress.warn(f"{found}: {WRONG_CAMERAS}; the training starts from {instead} instead")
+    if seeds == "random" or not run.path("seeds.ply").is_file():
+        points = random_points(config.gaussians, views.box, generator)
+    else:
         given = stack_fields(read_vertices(run.path("seeds.ply"), ("x", "y", "z")), ("x", "y", "z"))
         points = given_points(views.similarity.to_unit(given.astype(np.float64)), config.gaussians, generator)
-    else:
-        points = random_points(config.gaussians, views.box, generator)
+        if seeds == "auto":  # structure from motion finds few points where there is no texture
+            more = random_points(config.gaussians - len(points), views.box, generator)
+            points = np.concatenate([points, more])
     return start_gaussians(points, generator, config.initial_scale, config.initial_opacity)
 
 
@@ -462,28 +502,81 @@ def truth_path(run):
 def evaluate(run):
     """`edges.json` -> `metrics.json` and `metrics.csv`: EMAP's protocol, corners, free ends; without a truth fewer.
 
-    And what the held-out views say. Lengths are in the frame of the truth, in the unit cube where there is none.
+    And what the held-out views say. Lengths are in the frame of the truth, in the unit cube where there is none. With a
+    scan for a truth also `pseudo_truth.ply`, its points on edges (input frame).
     """
-    from taichi_edges.evaluation.ground_truth import read_ground_truth
     from taichi_edges.evaluation.held_out import held_out_metrics
     from taichi_edges.evaluation.metrics import evaluate as measure
     from taichi_edges.evaluation.metrics import exact_polylines, measure_alone
 
     edges, _ = read_edges(run.path("edges.json"))
-    views, path = read_views(run.path("views.npz")), truth_path(run)
-    unit = edges.transformed(views.similarity.to_unit)
-    if path is None:
-        metrics, source = measure_alone(unit), None
+    views, held_out = read_views(run.path("views.npz")), read_views(run.path("held_out.npz"))
+    unit, truth = edges.transformed(views.similarity.to_unit), _ground_truth(run, views, held_out)
+    if truth is None:
+        metrics = measure_alone(unit)
     else:
-        to_truth, from_truth = views.input_to_truth, np.linalg.inv(views.input_to_truth)
-        truth = read_ground_truth(path, lambda points: views.similarity.to_unit(transform(from_truth, points)))
-        into_frame = partial(transform, to_truth) if truth.own_frame else views.similarity.to_unit
-        metrics, source = measure(edges.transformed(into_frame), truth), truth.source
-    metrics |= held_out_metrics(exact_polylines(unit), views, read_views(run.path("held_out.npz")))
-    metrics["ground_truth"] = source
+        metrics = measure(
+            edges.transformed(partial(transform, views.input_to_truth)) if truth.own_frame else unit, truth
+        )
+    metrics |= held_out_metrics(exact_polylines(unit), views, held_out)
+    metrics["ground_truth"] = truth and truth.source
     write_json(run.path("metrics.json"), metrics)
     _write_csv(run.path("metrics.csv"), [("metric", "value"), *metrics.items()])
-    return metrics
+    return {**metrics, "files": _write_pseudo_truth(run, views, truth)}
+
+
+def _ground_truth(run, views, held_out):
+    """The GroundTruth of the scene, or None. views, held_out: Views that found its edges, and the others."""
+    from taichi_edges.evaluation.ground_truth import read_ground_truth, read_sampled_ply
+    from taichi_edges.evaluation.projected_curves import Camera
+    from taichi_edges.evaluation.pseudo_truth import Votes, points_in_box, pseudo_truth
+
+    path, config, from_truth = truth_path(run), run.config.evaluation, np.linalg.inv(views.input_to_truth)
+
+    def to_unit(points):
+        return views.similarity.to_unit(transform(from_truth, points))
+
+    if path is None or config.kind != "scan":
+        return read_ground_truth(path, to_unit) if path else None
+    points = points_in_box(read_sampled_ply(path, to_unit).points, views.box, str(path))
+    cameras = {some.names[view]: Camera.of(some, view) for some in (views, held_out) for view in range(len(some))}
+    maps = _scan_maps(run, views, held_out)
+    with run.progress.track("scan", len(maps)) as report:
+        votes = Votes.of(points, [cameras[name] for name in maps], maps.values(), config.scan.threshold, report)
+    return pseudo_truth(points, votes, config.scan, str(path))
+
+
+def _scan_maps(run, views, held_out):
+    """{name of a view: (H, W) uint8 edge map} that a scan's points are projected on."""
+    folder, source = run.config.evaluation.scan.edges, run.config.source
+    names = [*views.names, *held_out.names]
+    if not folder:
+        return dict(zip(names, [*views.edge_maps, *held_out.edge_maps], strict=True))
+    if source.reader == "synthetic":
+        raise UserError("evaluation.scan.edges: a synthetic scene has no folders of maps; leave it out")
+    from taichi_edges.readers.frames import chosen_frames
+    from taichi_edges.readers.images import read_edge_maps
+    from taichi_edges.readers.undistortion import undistorted_frames
+
+    frames, made = chosen_frames(_listed_frames(run, edges=folder), source.skip), run.path("undistorted_for_scan")
+    frames = undistorted_frames(frames, made, source.max_size, source.gamma, run.threads, run.progress)
+    maps = dict(zip(frames.names, read_edge_maps(frames, run.progress, run.threads), strict=True))
+    if next(iter(maps.values())).shape != views.edge_maps.shape[1:]:
+        problem = f"its maps are not {views.width} x {views.height} px as the scene's views are"
+        raise UserError(f"evaluation.scan.edges: {folder}: {problem}; write them in that size")
+    return {name: maps[name] for name in names}
+
+
+def _write_pseudo_truth(run, views, truth):
+    """The names of the files written: the points of the GroundTruth, if they are those of a scan on edges."""
+    path = run.path("pseudo_truth.ply")
+    if run.config.evaluation.kind != "scan":
+        path.unlink(missing_ok=True)  # of an older run with other settings
+        return []
+    from taichi_edges.exporters.ply import write_float_vertices
+
+    write_float_vertices(path, ("x", "y", "z"), views.similarity.to_input(truth.points))
+    return [path.name]
 
 
 def export(run):
@@ -547,7 +640,17 @@ def truth_files(run):
         return []
     if run.config.evaluation.truth:  # that of a synthetic scene may still have to be written
         refuse_unknown(path)
-    return sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [Path(path)]
+    truth = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [Path(path)]
+    return truth + _scan_map_files(run)
+
+
+def _scan_map_files(run):
+    """The edge maps that the points of a scan are held against, where the scene names a folder of its own for them."""
+    source, config = run.config.source, run.config.evaluation
+    if config.kind != "scan" or not config.scan.edges or source.reader == "synthetic":
+        return []
+    frames = _listed_frames(run, edges=config.scan.edges)
+    return [Path(path) for path in frames.edge_paths if path and Path(path).is_file()]
 
 
 def read_facts(path):

@@ -147,19 +147,26 @@ def test_opengl_axes_look_along_minus_z(nerf):
     """Written out by hand: a camera at z = 3 that looks down on the cube, x to the right, y up."""
     lens = [[64.0, 0, 31.5], [0, 64.0, 31.5], [0, 0, 1]]
     pose = [[1.0, 0, 0, 0.5], [0, 1, 0, 0.5], [0, 0, 1, 3], [0, 0, 0, 1]]
-    for frame in nerf.content["frames"]:
-        frame.update(camera_intrinsics=lens, transform_matrix=pose)
+    nerf.content["frames"][0].update(camera_intrinsics=lens, transform_matrix=pose)
     pixels, depths = nerf.read().project(np.array([[0.5, 0.5, 1.0], [0.75, 0.5, 1], [0.5, 0.75, 1]]), 0)
     np.testing.assert_allclose(pixels, [[31.5, 31.5], [39.5, 31.5], [31.5, 23.5]])  # 0.25 right: +8 px; 0.25 up: -8 px
     np.testing.assert_allclose(depths, 2.0)
+
+
+def test_a_listing_can_be_named_in_place_of_its_folder(folder):
+    expected = folder.read()
+    other = folder.listing.rename(folder.path / "other.json")
+    config = SourceConfig(reader=folder.kind, path="unused", **({"edges": "edge"} if folder.kind == "emap" else {}))
+    views = views_of_maps(READERS[folder.kind](other, config), config, UNIT_BOX, folder.warnings)
+    assert views.names == expected.names
+    np.testing.assert_array_equal(views.world_to_camera, expected.world_to_camera)
 
 
 def test_opencv_axes_look_along_z(emap):
     """Written out by hand: a camera at z = -2 that looks up at the cube from below, x to the right, y down."""
     lens = [[64.0, 0, 31.5], [0, 64.0, 31.5], [0, 0, 1]]
     pose = [[1.0, 0, 0, 0.5], [0, 1, 0, 0.5], [0, 0, 1, -2], [0, 0, 0, 1]]
-    for frame in emap.content["frames"]:
-        frame.update(intrinsics=lens, camtoworld=pose)
+    emap.content["frames"][0].update(intrinsics=lens, camtoworld=pose)
     pixels, depths = emap.read().project(np.array([[0.5, 0.5, 0.0], [0.75, 0.5, 0], [0.5, 0.75, 0]]), 0)
     np.testing.assert_allclose(pixels, [[31.5, 31.5], [39.5, 31.5], [31.5, 39.5]])
     np.testing.assert_allclose(depths, 2.0)

@@ -7,7 +7,7 @@ import yaml
 
 from taichi_edges.errors import UserError
 from taichi_edges.scene import PRESETS, SCALES, SceneConfig
-from taichi_edges.scene_file import load_scene
+from taichi_edges.scene_file import check_scene, load_scene
 
 SCENES = sorted((Path(__file__).parent.parent / "scenes").glob("*.yaml"))
 SYNTHETIC = "source: {reader: synthetic, part: block}\n"
@@ -350,6 +350,19 @@ def test_an_unknown_preset_is_refused(scene):
 def test_a_scene_cannot_be_changed_after_loading(scene):
     with pytest.raises(Exception, match="frozen"):
         load_scene(scene()).train.epochs = 3
+
+
+@pytest.mark.parametrize(
+    ("written", "meant"),
+    [("auto", "auto"), ("off", "off"), (False, "off"), (True, "auto"), (4, 4), (["a", "b"], ["a", "b"])],
+)
+def test_views_are_held_out_by_number_or_name(written, meant):
+    scene = {"source": {"reader": "emap", "path": "x"}, "evaluation": {"held_out": written}}
+    assert check_scene(scene, "the test").evaluation.held_out == meant
+    for wrong in (0, -1, 2.5, "some", [], [3]):
+        scene["evaluation"] = {"held_out": wrong}
+        with pytest.raises(UserError, match="evaluation.held_out: must be auto, off or a number, or a list of names"):
+            check_scene(scene, "the test")
 
 
 # ------------------------------------------------------------------------------------------------------------ scales

@@ -182,19 +182,21 @@ class Warned:
         self.lines.append(text)
 
 
-@pytest.mark.parametrize("points, named", [("", "random points"), ("cloud.ply", "source.points")])
+@pytest.mark.parametrize("points, named", [("", "random points"), ("cloud.ply", "the given points")])
 def test_without_votes_the_training_starts_from_the_given_or_random_points(
     start_taichi, views, tmp_path, generator, points, named
 ):
     start_taichi("f32", 2)
     blank = replace(views, edge_maps=np.zeros_like(views.edge_maps))
     given = generator.random((80, 3)).astype(np.float32)
-    write_float_vertices(tmp_path / "seeds.ply", ("x", "y", "z"), given)
+    if points:
+        write_float_vertices(tmp_path / "seeds.ply", ("x", "y", "z"), given)
     source = {"reader": "emap", "path": "there", "points": points}
     config = SceneConfig(source=source, train={"seeds": "votes", "gaussians": 300})
     warned = Warned()
     gaussians = stages._start(Run(config, tmp_path, progress=warned), blank, np.random.default_rng(0))
     assert len(warned.lines) == 1 and warned.lines[0].endswith(f"the training starts from {named} instead")
+    assert "poses or intrinsics may not be those of these images" in warned.lines[0]
     assert len(gaussians) == (80 if points else 300)
     if points:
         np.testing.assert_allclose(gaussians.means, given, atol=1e-6)

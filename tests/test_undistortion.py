@@ -40,7 +40,7 @@ def lens_of(model="OPENCV", size=SIZE):
 def make(tmp_path):
     """make({name: image}, lenses, edges, masks, max_size) -> (Frames, what was said), its folder of files kept."""
 
-    def run_make(images, lenses, edges=None, masks=None, max_size=0, threads=2):
+    def run_make(images, lenses, edges=None, masks=None, max_size=0, threads=2, intrinsics=None):
         paths = {}
         for kind, files in (("images", images), ("edges", edges or {}), ("masks", masks or {})):
             paths[kind] = [tmp_path / kind / f"{name}.png" if name in files else "" for name in images]
@@ -54,7 +54,7 @@ def make(tmp_path):
             names=list(images),
             edge_paths=paths["edges"],
             image_paths=paths["images"],
-            intrinsics=[None] * len(images),
+            intrinsics=intrinsics or [None] * len(images),
             camera_to_world=[np.eye(4)] * len(images),
             opengl=False,
             lenses=lenses,
@@ -136,6 +136,18 @@ def test_pictures_resized_since_the_cameras_were_made_scale_the_intrinsics(make,
     assert f"images of {size[0]} x {size[1]} px for cameras of 320 x 240 px" in said.texts[0]
 
 
+def test_large_pictures_without_a_lens_are_made_smaller_with_their_intrinsics(make):
+    own = np.array([[300.0, 0, 160], [0, 310, 118.5], [0, 0, 1]])
+    drawn = picture_of_polygon(camera("PINHOLE"), POLYGON)
+    frames, _ = make({"a": drawn, "b": drawn}, [], max_size=200, intrinsics=[lambda width, height: own] * 2)
+    picture = read(frames.image_paths[1])
+    assert picture.shape == (150, 200) and frames.size == (200, 150)
+    given = frames.intrinsics[1](200, 150)
+    assert np.allclose(given, [[187.5, 0, 160.5 * 0.625 - 0.5], [0, 193.75, 119 * 0.625 - 0.5], [0, 0, 1]])
+    distances, found = off_the_polygon(picture, given)
+    assert np.quantile(distances, 0.95) < 0.1 and found > 0.7
+
+
 def test_turned_pictures_are_refused_and_the_cause_is_named(make):
     drawn = picture_of_polygon(camera("OPENCV"), POLYGON)
     with pytest.raises(UserError, match=r"1 of 2 views \(b\): the image is 240 x 320 px, .* EXIF"):
@@ -194,7 +206,7 @@ def test_pictures_are_made_once_and_again_when_one_changes(make):
     assert said.steps["undistort"] == 2
     times = [Path(path).stat().st_mtime_ns for path in first.image_paths]
     again, said = make(images, lenses, threads=1)
-    assert said.steps["undistort"] == 0 and again.image_paths == first.image_paths
+    assert said.steps == {} and again.image_paths == first.image_paths
     edges = {"a": drawn}
     _, said = make(images, lenses, edges)  # another detector's maps leave the images alone
     assert said.steps["undistort"] == 1

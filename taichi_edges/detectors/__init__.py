@@ -22,16 +22,20 @@ def read_maps(frames, run):
 
 def detect_subpixel(frames, run):
     """Edgels by our own detector, and maps drawn through them."""
+    import numpy as np
+
     from taichi_edges.detectors.drawing import draw_edge_maps
     from taichi_edges.detectors.subpixel import trace_pictures
-    from taichi_edges.readers.images import check_sizes, frames_with_images
+    from taichi_edges.readers.images import check_sizes, frames_with_images, name_edgeless
 
     frames = frames_with_images(frames, run.progress)
     with run.progress.track("detect", len(frames.names)) as report:
         edgels, sizes = trace_pictures(frames.image_paths, run.threads, report, run.config.source.gamma or None)
     check_sizes(frames, sizes, "colour image")
     if len(edgels) == 0:
-        raise UserError(f"{frames.where}: no edge found in any of {len(frames.names)} images; check source.images")
+        problem = f"no edge found in any of {len(frames.names)} images"
+        raise UserError(f"{frames.where}: {problem}; are they black, blank or out of focus? Check source.images")
+    name_edgeless(frames.names, np.diff(edgels.starts), run.progress)
     width, height = sizes[0]
     return frames, draw_edge_maps(edgels, height, width, run.threads), edgels
 

@@ -10,11 +10,10 @@ import cv2
 import numpy as np
 
 from taichi_edges.errors import UserError, name_some
-from taichi_edges.readers.frames import is_usable
+from taichi_edges.readers.images import read_mask
 
 RIM_PX = 6  # by which a mask grows: masks are drawn, or made by a network, to some pixels
 EMPTY_RIM_PX = 6  # by which what is empty grows: so far its border disturbs an edge detector
-KEPT = 128  # of 255: from here on a mask keeps
 
 
 def has_areas(frames):
@@ -37,25 +36,6 @@ def kept_area(mask_path, valid_path, size):
 
 def _disc(radius):
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-
-
-def read_mask(path, size):
-    """(H, W) uint8, 1 where a mask keeps. size: (width, height) px of the view, to which the mask is brought."""
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if is_usable(path) else None
-    if image is None:
-        raise UserError(
-            f"{path}: the mask is missing, truncated or not an image; write it again, or correct source.masks"
-        )
-    grey = image if image.ndim == 2 else image[:, :, : min(image.shape[2], 3)].max(axis=2)
-    full = np.iinfo(grey.dtype).max if grey.dtype.kind == "u" else 1.0
-    kept = (grey >= full * (KEPT / 255)).astype(np.uint8)
-    height, width = kept.shape
-    if (width, height) == tuple(size):
-        return kept
-    if abs(width * size[1] / size[0] - height) > 1 and abs(height * size[0] / size[1] - width) > 1:
-        problem = f"the mask is {width} x {height} px, its image {size[0]} x {size[1]} px"
-        raise UserError(f"{path}: {problem}; write it in that size, or set source.masks: none")
-    return cv2.resize(kept, tuple(size), interpolation=cv2.INTER_NEAREST)
 
 
 def within_masks(edgels, frames, size, progress):

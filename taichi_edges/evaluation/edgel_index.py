@@ -17,8 +17,8 @@ MOST_WINDING = np.pi  # length of a long edge by its extent: that of a full circ
 class EdgelIndex:
     """The edgels of one view, to be looked up by pixel.
 
-    points, normals: (e, 2) of the view's edgels. order: (e,) their indices, pixel by pixel. starts: (H * W + 1,) where
-    in `order` each pixel begins. size: (width, height), pixels.
+    points, normals: (e, 2) float32, of the edgels. order: (e,) int32 indices, pixel by pixel. starts: (H * W + 1,)
+    int32, where in `order` each pixel begins. size: (width, height), pixels.
     """
 
     points: np.ndarray
@@ -30,29 +30,33 @@ class EdgelIndex:
     @staticmethod
     def of(points, normals, width, height):
         """Of the (e, 2) points and unit normals of a view."""
-        nearest = np.rint(points).astype(np.int64)
-        pixels = np.clip(nearest[:, 1], 0, height - 1) * width + np.clip(nearest[:, 0], 0, width - 1)
-        starts = np.concatenate([[0], np.cumsum(np.bincount(pixels, minlength=width * height))])
-        return EdgelIndex(points, normals, np.argsort(pixels, kind="stable"), starts, (width, height))
+        columns, rows = np.clip(np.rint(points.T), 0, [[width - 1], [height - 1]]).astype(np.int32)
+        pixels = rows * np.int32(width) + columns
+        starts = np.zeros(width * height + 1, np.int32)
+        np.cumsum(np.bincount(pixels, minlength=width * height), out=starts[1:])
+        order = np.argsort(pixels, kind="stable").astype(np.int32)
+        points, normals = (np.asarray(array, np.float32) for array in (points, normals))
+        return EdgelIndex(points, normals, order, starts, (width, height))
 
     def pairs(self, places, radius):
         """Which edgels lie within `radius` px of which of the (n, 2) places.
 
         Returns the index of the place, ascending, that of the edgel, and the (k, 2) px from the edgel to the place.
         """
-        width, height = self.size
-        first = np.clip(np.rint(places - radius).astype(np.int64), 0, [width - 1, height - 1])
-        last = np.clip(np.rint(places + radius).astype(np.int64), 0, [width - 1, height - 1])
-        rows = first[:, 1:] + np.arange(int(np.ceil(2 * radius)) + 1)
+        (width, height), places = self.size, np.asarray(places, np.float32)
+        last_pixel = np.array([width - 1, height - 1])
+        first = np.clip(np.rint(places - radius), 0, last_pixel).astype(np.int32)
+        last = np.clip(np.rint(places + radius), 0, last_pixel).astype(np.int32)
+        rows = first[:, 1:] + np.arange(int(np.ceil(2 * radius)) + 1, dtype=np.int32)
         # The pixels of a row follow each other, and so do their edgels: one stretch for each place and row.
-        offsets = np.minimum(rows, height - 1) * width
+        offsets = np.minimum(rows, height - 1) * np.int32(width)
         begin, end = self.starts[offsets + first[:, :1]], self.starts[offsets + last[:, :1] + 1]
         counts = np.where(rows <= last[:, 1:], end - begin, 0).ravel()
-        stretch = np.repeat(np.arange(len(counts)), counts)
-        at = stretch // rows.shape[1]
-        found = self.order[(begin.ravel() - np.cumsum(counts) + counts)[stretch] + np.arange(len(stretch))]
+        ahead = begin.ravel() - np.cumsum(counts, dtype=np.int32) + counts
+        at = np.repeat(np.arange(len(places), dtype=np.int32), counts.reshape(rows.shape).sum(axis=1))
+        found = self.order[np.repeat(ahead, counts) + np.arange(len(at), dtype=np.int32)]
         away = places[at] - self.points[found]
-        near = away[:, 0] ** 2 + away[:, 1] ** 2 <= radius**2
+        near = away[:, 0] ** 2 + away[:, 1] ** 2 <= np.float32(radius**2)
         return at[near], found[near], away[near]
 
     def agreeing(self, places, directions, radius):
@@ -81,8 +85,9 @@ class EdgelIndex:
 
     def _chain_sizes(self, count, chains):
         """(c,) pixels that each chain covers, and (c,) px of the diagonal of its bounding box. chains: (e,) int."""
-        nearest = np.rint(self.points).astype(np.int64)
-        covered = np.unique(np.stack([chains, *nearest.T], axis=1), axis=0)[:, 0]
+        columns, rows = np.clip(np.rint(self.points.T).astype(np.int64), 0, np.array(self.size)[:, None] - 1)
+        pixels = self.size[0] * self.size[1]
+        covered = np.unique(chains.astype(np.int64) * pixels + rows * self.size[0] + columns) // pixels
         low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
         np.minimum.at(low, chains, self.points)
         np.maximum.at(high, chains, self.points)

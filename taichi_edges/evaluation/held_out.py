@@ -26,6 +26,7 @@ REACH_PX = (
 # but neither hidden
 SPACING_PX = 0.75  # of the samples of a projected edge: edgels are about 1 px apart
 PLACE_PX = 4.0  # between the places of an edge that the views are asked about, at the middle of the scene box
+MOST_PLACES = 20_000  # of all edges; where these are longer, the places are farther apart
 NEIGHBORS = 8  # views nearest by direction that say whether a place is visible from there, by angle^-2 each,
 VISIBLE = 0.7  # and how much of their weight must see it: of the true edges of synthetic parts, one in twenty of the
 # places that are hidden passes, and three in four of those that are visible
@@ -41,21 +42,23 @@ ASIDE_EVERY = 4  # samples that are displaced: chance needs no more
 def choose_held_out(names, wanted):
     """Indices of the views to hold out, ascending. wanted: 'auto', 'off', a number, or a tuple of names.
 
-    Those that `auto` and a number choose are spread evenly over the order of the views; the first and the last stay,
-    at the ends of a path of cameras.
+    Those that `auto` and a number choose are in the middles of equal stretches of all views; the first and the last
+    stay, at the ends of a path of cameras.
     """
     if isinstance(wanted, (tuple, list)):
         for name in wanted:
             if name not in names:
                 raise UserError(f"evaluation.held_out: there is no view '{name}'{did_you_mean(name, list(names))}")
-        chosen = sorted({list(names).index(name) for name in wanted})
+        chosen = {list(names).index(name) for name in wanted}
     else:
         count = {"off": 0, "auto": _automatic(len(names))}.get(wanted, wanted)
-        chosen = [1 + (2 * number + 1) * (len(names) - 2) // (2 * count) for number in range(count)]
-    if chosen and len(names) - len(chosen) < LEAST_LEFT:
-        left = f"{len(chosen)} of {len(names)} views leave too few to find edges in"
-        raise UserError(f"evaluation.held_out: {left} (at least {LEAST_LEFT}); hold out fewer, or none: off")
-    return chosen
+        middles = ((2 * number + 1) * len(names) // (2 * count) for number in range(count))
+        chosen = {min(max(middle, 1), len(names) - 2) for middle in middles}
+    left = len(names) - len(chosen)
+    if chosen and (left < LEAST_LEFT or left < len(chosen)):
+        problem = f"{len(chosen)} of {len(names)} views leave too few to find edges in"
+        raise UserError(f"evaluation.held_out: {problem}; hold out at most half of them, and leave {LEAST_LEFT}")
+    return sorted(chosen)
 
 
 def _automatic(count):
@@ -173,7 +176,8 @@ def held_out_metrics(polylines, training, held_out):
     scores = []
     chords = Chords.of(polylines)
     if len(held_out):
-        places, tangents, ends = chords.places(PLACE_PX * pixel_size(training))
+        spacing = max(PLACE_PX * pixel_size(training), chords.travelled[-1] / MOST_PLACES)
+        places, tangents, ends = chords.places(spacing)
         sightings = Sightings.of(places, tangents, training)
         scores = [score_view(chords, ends, sightings, held_out, view) for view in range(len(held_out))]
     return {"held_out_views": len(held_out), **metrics_of(scores)}

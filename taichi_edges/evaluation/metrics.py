@@ -142,11 +142,11 @@ def sample_prediction(edges):
     return average_per_voxel(np.concatenate(samples).astype(np.float32))
 
 
-def average_per_voxel(points):
-    """(n, 3) float32 -> (m, 3) float32, the mean of the points of each voxel that has any."""
+def average_per_voxel(points, per_unit=VOXELS_PER_UNIT):
+    """(n, 3) float32 -> (m, 3) float32, the mean of the points of each voxel, `per_unit` on a unit, that has any."""
     if not len(points):
         return points
-    voxels = np.floor((points + np.float32(1.0)) * np.float32(VOXELS_PER_UNIT)).astype(np.int64)
+    voxels = np.floor((points + np.float32(1.0)) * np.float32(per_unit)).astype(np.int64)
     _, owner, counts = np.unique(voxels, axis=0, return_inverse=True, return_counts=True)
     sums = [np.bincount(owner.ravel(), weights=points[:, axis], minlength=len(counts)) for axis in range(3)]
     return (np.stack(sums, axis=1) / counts[:, None]).astype(np.float32)

@@ -1,17 +1,33 @@
 """Frames: what a reader found on disk, before anything is decoded; and how frames become Views, with every check."""
 
+import functools
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from taichi_edges.cameras import OPENGL_TO_OPENCV, Similarity, inside_image, invert_pose, project
+from taichi_edges.cameras import OPENGL_TO_OPENCV, Similarity, invert_pose
 from taichi_edges.errors import UserError, did_you_mean, name_some
+from taichi_edges.photogrammetry import undistorted
+from taichi_edges.progress import Progress
+from taichi_edges.readers.picture_sizes import picture_size
+from taichi_edges.readers.scene_checks import (
+    LEAVE_OUT,
+    Cameras,
+    check_box,
+    check_places,
+    check_points,
+    check_views,
+    into_unit_cube,
+    views_in_sight,
+)
 from taichi_edges.views import Views
 
 ORTHONORMAL_TOLERANCE = 1e-3  # largest deviation of R^T R from the identity; files store six digits or more
-BOX_GRID = 9  # points along each side of the scene box that are looked for in every view
+TURNED_FROM, TURNED_TO = 0.1, 0.3  # off the centre of the image; of that, off the centre of the turned image
+TURNED_BY_EXIF = "a program has rotated the file by its EXIF orientation; use the images that the cameras are of"
+MOST_SEE = 0.5  # share of the views that must see a box for it to be about right
 OFF_CENTRE = 0.25  # of the image's size: a principal point farther from the centre is worth a warning
 PER_VIEW = (
     "names",
@@ -23,7 +39,6 @@ PER_VIEW = (
     "valid_paths",
     "lenses",
 )
-LEAVE_OUT = "or leave such views out with source.skip"
 TAIL_BYTES = 64  # some writers pad the file behind its end marker
 # What a whole file ends with; a decoder alone may fill the missing rows of a truncated file with grey.
 END_MARKERS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
@@ -104,20 +119,16 @@ def build_views(frames, edge_maps, edgels, config, box, progress):
     edge_maps: (V, H, W) uint8. edgels: Edgels, or None where they are still to be traced. config: the scene's `source`
     section. box: (2, 3) corners, input units.
     """
-    opengl = frames.opengl if config.axes == "auto" else config.axes == "opengl"
-    poses = camera_poses(frames)
-    poses = poses @ OPENGL_TO_OPENCV if opengl else poses
     height, width = edge_maps.shape[1:]
     intrinsics = np.stack([intrinsics_for(width, height) for intrinsics_for in frames.intrinsics])
-    _check_intrinsics(frames, intrinsics, width, height, progress)
-    _check_box_seen(frames, intrinsics, poses, np.asarray(box, dtype=np.float64), (width, height), opengl)
-    world_to_camera = invert_pose(poses)
+    cameras = _cameras(frames, intrinsics, [(width, height)] * len(intrinsics), config.axes)
+    _check_scene(frames, cameras, box, progress)
     similarity = Similarity.of_box(box)
     return Views(
         names=tuple(frames.names),
         edge_maps=edge_maps,
         intrinsics=intrinsics,
-        world_to_camera=into_unit_cube(world_to_camera, similarity),
+        world_to_camera=into_unit_cube(invert_pose(cameras.poses), similarity),
         image_paths=tuple(_usable_images(frames, progress)),
         similarity=similarity,
         box=similarity.to_unit(np.asarray(box, dtype=np.float64)),
@@ -126,19 +137,75 @@ def build_views(frames, edge_maps, edgels, config, box, progress):
     )
 
 
+def check_before_detection(frames, config, box):
+    """UserError where cameras, box and points cannot be those of one scene: that shall not wait for the detector.
+
+    The intrinsics are those of lenses, or what the size of the first picture means; all is checked again when the
+    pictures are decoded. config: the scene's `source` section. box: (2, 3) corners, input units.
+    """
+    cameras = _cameras_before_detection(frames, config)
+    if cameras is not None:
+        _check_scene(frames, cameras, box, Progress())
+
+
+def frames_in_sight(frames, config, box, progress):
+    """The frames that see some of a box that nobody has set by hand; a few that do not are named in a warning.
+
+    Where most see nothing, something else is wrong. config, box: as for `check_before_detection`.
+    """
+    cameras = _cameras_before_detection(frames, config)
+    seeing = np.ones(len(frames.names), bool) if cameras is None else views_in_sight(cameras, box)
+    if seeing.all() or seeing.mean() < MOST_SEE:
+        return frames
+    lost = [name for name, sees in zip(frames.names, seeing, strict=True) if not sees]
+    progress.warn(f"{len(lost)} of {len(seeing)} views see nothing of the scene box, left out: {name_some(lost)}")
+    return subset(frames, np.flatnonzero(seeing))
+
+
+def _cameras(frames, intrinsics, sizes, axes):
+    """The Cameras of frames. sizes: (V, 2) width and height, pixels. axes: `source.axes`."""
+    opengl = frames.opengl if axes == "auto" else axes == "opengl"
+    poses = camera_poses(frames)
+    return Cameras(intrinsics, poses @ OPENGL_TO_OPENCV if opengl else poses, np.asarray(sizes), opengl)
+
+
+def _check_scene(frames, cameras, box, progress):
+    check_views(frames)
+    check_places(frames, cameras.poses)
+    _check_intrinsics(frames, cameras.intrinsics, cameras.sizes, progress)
+    check_points(frames, cameras)
+    check_box(frames, cameras, np.asarray(box, dtype=np.float64))
+
+
+def _cameras_before_detection(frames, config):
+    """The Cameras of frames of which no picture is decoded; None where no picture tells a size."""
+    common, intrinsics, sizes = _size_of_a_picture(frames), [], []
+    for lens, intrinsics_for in zip(frames.lenses, frames.intrinsics, strict=True):
+        if lens is None and common is None:
+            return None
+        matrix_of_lens, size = _undistorted(lens) if lens else (intrinsics_for(*common), common)
+        intrinsics.append(matrix_of_lens)
+        sizes.append(size)
+    return _cameras(frames, np.stack(intrinsics), sizes, config.axes)
+
+
+@functools.lru_cache(maxsize=256)
+def _undistorted(lens):
+    """`photogrammetry.undistorted`; many views share a lens."""
+    return undistorted(lens)
+
+
+def _size_of_a_picture(frames):
+    """(width, height) of the first image or edge map that can be read, pixels; None without any."""
+    paths = (path for pair in zip(frames.image_paths, frames.edge_paths, strict=True) for path in pair)
+    return next(filter(None, (picture_size(path) for path in paths if is_usable(path))), None)
+
+
 def camera_poses(frames):
     """(V, 4, 4) camera-to-world as the file has them; UserError where one is no rigid motion."""
     poses = np.stack([matrix(pose, (4, 4), frames.where, f"the pose of {name}") for name, pose in _each(frames)])
     _check_poses(frames, poses)
     return poses
-
-
-def into_unit_cube(world_to_camera, similarity):
-    """The same cameras for a world that went through the similarity: camera units become unit-cube units too."""
-    moved = world_to_camera.copy()
-    rotations, translations = world_to_camera[:, :, :3], world_to_camera[:, :, 3]
-    moved[:, :, 3] = similarity.scale * translations - rotations @ np.asarray(similarity.offset)
-    return moved
 
 
 def _each(frames):
@@ -155,6 +222,7 @@ def chosen_frames(frames, skip):
         raise UserError(f"{frames.where}: source.skip leaves out all of its {len(frames.names)} views; shorten it")
     frames = subset(frames, keep)
     _check_names(frames)
+    check_views(frames)
     return frames
 
 
@@ -196,7 +264,7 @@ def refuse_views(frames, bad, problem):
         raise UserError(f"{frames.where}: {len(names)} of {len(bad)} views ({name_some(names)}): {problem}")
 
 
-def _check_intrinsics(frames, intrinsics, width, height, progress):
+def _check_intrinsics(frames, intrinsics, sizes, progress):
     focal = intrinsics[:, [0, 1], [0, 1]]
     bad = ~np.isfinite(intrinsics).all(axis=(1, 2)) | (focal <= 0).any(axis=1)
     refuse_views(frames, bad, f"the focal length is not a positive number; correct the intrinsics, {LEAVE_OUT}")
@@ -206,14 +274,25 @@ def _check_intrinsics(frames, intrinsics, width, height, progress):
     )
     skewed = np.abs(intrinsics[:, 0, 1]) > 1e-6 * focal[:, 0]
     refuse_views(frames, skewed, "the intrinsics have skew, which is not supported; rectify the images")
-    outside = (intrinsics[:, :2, 2] < 0).any(axis=1) | (intrinsics[:, :2, 2] > [width, height]).any(axis=1)
-    problem = f"the principal point is outside the {width} x {height} px image (resized after calibration?)"
+    _check_centres(frames, intrinsics[:, :2, 2], sizes, progress)
+
+
+def _check_centres(frames, centres, sizes, progress):
+    """Principal points, (V, 2) pixels, inside the images of (V, 2) sizes, and near their middle."""
+    image = "the {} x {} px image".format(*sizes[0])
+    off, off_turned = (np.abs((centres + 0.5) / sides - 0.5).max(axis=1) for sides in (sizes, sizes[:, ::-1]))
+    turned = (off > TURNED_FROM) & (off_turned < TURNED_TO * off)
+    problem = f"the principal point is in the middle of a picture of {sizes[0][1]} x {sizes[0][0]} px, not of {image}"
+    cure = f"turned: {TURNED_BY_EXIF}, or export both again, {LEAVE_OUT}"
+    refuse_views(frames, turned & (2 * turned.sum() > len(turned)), f"{problem}, {cure}")
+    outside = (centres < 0).any(axis=1) | (centres > sizes).any(axis=1)
+    problem = f"the principal point is outside {image} (resized after calibration?)"
     refuse_views(frames, outside, f"{problem}; correct the intrinsics, {LEAVE_OUT}")
-    off_centre = np.abs((intrinsics[:, :2, 2] + 0.5) / [width, height] - 0.5).max(axis=1) > OFF_CENTRE
-    if off_centre.any():
-        names = name_some([name for name, is_off in zip(frames.names, off_centre, strict=True) if is_off])
-        what = f"the principal point is far from the centre of the {width} x {height} px image"
-        progress.warn(f"{off_centre.sum()} of {len(off_centre)} views: {what} (resized after calibration?): {names}")
+    far = off > OFF_CENTRE
+    if far.any():
+        names = name_some([name for name, is_far in zip(frames.names, far, strict=True) if is_far])
+        what = f"the principal point is far from the centre of {image}"
+        progress.warn(f"{far.sum()} of {len(far)} views: {what} (resized after calibration?): {names}")
 
 
 def folders_beside(frames):
@@ -249,36 +328,3 @@ def _usable_images(frames, progress):
         problem = "is missing or truncated; their overlays show the edge map instead"
         progress.warn(f"{len(lost)} of {len(wanted)} views: the colour image {problem}: {name_some(lost)}")
     return [str(path) if ok else "" for path, ok in zip(wanted, usable, strict=True)]
-
-
-def _check_box_seen(frames, intrinsics, poses, box, size, opengl):
-    """Every view must have some of the scene box in front of it and inside the image."""
-    seeing = _views_that_see(box, intrinsics, invert_pose(poses), size)
-    corners = " to ".join("(" + ", ".join(f"{x:g}" for x in corner) + ")" for corner in box)
-    if not seeing.any():
-        used, other = ("OpenGL", "opencv") if opengl else ("OpenCV", "opengl")
-        centre = "(" + ", ".join(f"{x:.3g}" for x in poses[:, :3, 3].mean(axis=0)) + ")"
-        flipped = poses @ OPENGL_TO_OPENCV
-        inverted = OPENGL_TO_OPENCV @ flipped if opengl else poses  # what the file holds, taken for world-to-camera
-        seeing_flipped = _views_that_see(box, intrinsics, invert_pose(flipped), size).sum()
-        seeing_inverted = _views_that_see(box, intrinsics, inverted[:, :3], size).sum()
-        if seeing_inverted > seeing_flipped:
-            cure = "the poses seem to be world-to-camera; this layout has camera-to-world"
-        elif seeing_flipped:
-            cure = f"the poses were read with {used} axes; set source.axes: {other}"
-        else:
-            cure = f"correct the box (the cameras are around {centre}) or source.axes, now {used}"
-        raise UserError(f"{frames.where}: 0 of {len(seeing)} views see the scene box {corners}: {cure}")
-    refuse_views(frames, ~seeing, f"the scene box {corners} is not in sight; correct the box or the pose, {LEAVE_OUT}")
-
-
-def _views_that_see(box, intrinsics, world_to_camera, size):
-    """(V,) bool: which views have at least one point of a grid through the (2, 3) box inside the image.
-
-    In the unit cube, as all that follows: what is too near for a camera does not depend on the units of the input.
-    """
-    similarity = Similarity.of_box(box)
-    axes = [np.linspace(low, high, BOX_GRID) for low, high in zip(*similarity.to_unit(box), strict=True)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    cameras = zip(intrinsics, into_unit_cube(world_to_camera, similarity), strict=True)
-    return np.array([inside_image(project(grid, lens, pose)[0], *size).any() for lens, pose in cameras])

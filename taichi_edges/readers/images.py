@@ -5,9 +5,19 @@ from pathlib import Path
 
 import numpy as np
 
+from taichi_edges.artefacts import digest_file
 from taichi_edges.errors import UserError, name_some
-from taichi_edges.readers.frames import LEAVE_OUT, folders_beside, is_usable, is_whole, refuse_views, subset
+from taichi_edges.readers.frames import (
+    LEAVE_OUT,
+    TURNED_BY_EXIF,
+    folders_beside,
+    is_usable,
+    is_whole,
+    refuse_views,
+    subset,
+)
 
+MASK_KEEPS = 128  # of 255, from here on
 MOSTLY_EDGES = 0.5  # share of edge pixels from which on the maps must be black on white
 
 
@@ -31,6 +41,38 @@ def frames_with_images(frames, progress):
     return subset(frames, [i for i, ok in enumerate(usable) if ok])
 
 
+def refuse_copies(frames, progress):
+    """UserError where all pictures are one and the same file; copies among others are named in a warning."""
+    paths = [next((Path(p) for p in pair if is_usable(p)), None) for pair in zip(frames.image_paths, frames.edge_paths)]
+    kinds = {}
+    for name, path in zip(frames.names, paths, strict=True):
+        if path is not None:
+            kinds.setdefault(digest_file(path), []).append(name)
+    first = next((path for path in paths if path is not None), None)
+    if len(kinds) == 1 and len(frames.names) > 1:
+        if _is_blank(first):
+            return  # which is worse, and said by whoever looks for edges
+        count = len(frames.names)
+        raise UserError(f"{first.parent}: all {count} pictures are copies of one file; check how they were written")
+    copies = [name for names in kinds.values() for name in names[1:]]
+    if copies:
+        progress.warn(f"{len(copies)} of {len(frames.names)} pictures are copies of others: {name_some(copies)}")
+
+
+def _is_blank(path):
+    import cv2
+
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    return image is None or (image == image[:1, :1]).all()
+
+
+def name_edgeless(names, counts, progress):
+    """A warning that names the views whose picture shows no edge. counts: (V,) of edge pixels or edgels."""
+    empty = [name for name, count in zip(names, counts, strict=True) if not count]
+    if empty:
+        progress.warn(f"{len(empty)} of {len(names)} pictures show no edge and teach nothing: {name_some(empty)}")
+
+
 def check_sizes(frames, sizes, what):
     """UserError where the (width, height) of some image, `what` it is, is not that of the others or of the file."""
     size = frames.size or max(set(sizes), key=sizes.count)
@@ -39,7 +81,8 @@ def check_sizes(frames, sizes, what):
         width, height = sizes[int(wrong.argmax())]
         expected = f"{frames.where.name} says" if frames.size else "the others are"
         problem = f"the {what} is {width} x {height} px, but {expected} {size[0]} x {size[1]} px"
-        refuse_views(frames, wrong, f"{problem}; write it in that size, {LEAVE_OUT}")
+        cure = f"turned: {TURNED_BY_EXIF}" if (height, width) == tuple(size) else "write it in that size"
+        refuse_views(frames, wrong, f"{problem}; {cure}, {LEAVE_OUT}")
 
 
 def read_edge_maps(frames, progress, threads=None):
@@ -101,3 +144,24 @@ def read_grey(path):
     if image.dtype != np.uint8:
         return None
     return image if image.ndim == 2 else np.ascontiguousarray(image[:, :, :3].max(axis=2))
+
+
+def read_mask(path, size=None):
+    """(H, W) uint8, 1 where a mask keeps. size: (width, height) px of the view, to which the mask is brought."""
+    import cv2
+
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if is_usable(path) else None
+    if image is None:
+        raise UserError(
+            f"{path}: the mask is missing, truncated or not an image; write it again, or correct source.masks"
+        )
+    grey = image if image.ndim == 2 else image[:, :, : min(image.shape[2], 3)].max(axis=2)
+    full = np.iinfo(grey.dtype).max if grey.dtype.kind == "u" else 1.0
+    kept = (grey >= full * (MASK_KEEPS / 255)).astype(np.uint8)
+    height, width = kept.shape
+    if size is None or (width, height) == tuple(size):
+        return kept
+    if abs(width * size[1] / size[0] - height) > 1 and abs(height * size[0] / size[1] - width) > 1:
+        problem = f"the mask is {width} x {height} px, its image {size[0]} x {size[1]} px"
+        raise UserError(f"{path}: {problem}; write it in that size, or set source.masks: none")
+    return cv2.resize(kept, tuple(size), interpolation=cv2.INTER_NEAREST)

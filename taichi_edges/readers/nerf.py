@@ -13,9 +13,10 @@ from taichi_edges.errors import UserError
 from taichi_edges.readers.frames import Frames, matrix, read_json
 
 
-def read_nerf(folder, config):
-    """Frames of a NEF folder. config: the scene's `source` section."""
-    where = folder / f"transforms_{config.split}.json"
+def read_nerf(path, config):
+    """Frames of a NEF folder, or of one of its files. config: the scene's `source` section."""
+    where = path if path.is_file() else path / f"transforms_{config.split}.json"
+    folder = where.parent
     content = read_json(where, "a NEF folder holds transforms_<split>.json")
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:

@@ -66,8 +66,9 @@ def undistorted_frames(frames, folder, max_size, gamma=None, threads=None, progr
     max_size: px of the longest side from which on photographs are made smaller, 0: never. gamma: see `as_picture`.
     """
     sizes = _picture_sizes(frames, threads)
-    if not any(frames.lenses) and (len(set(sizes)) > 1 or not 0 < max_size < max(sizes[0])):
-        return frames  # those of one size need nothing, those of several are refused later
+    as_told = len(set(sizes)) == 1 and frames.size in (None, sizes[0])
+    if not any(frames.lenses) and not (as_told and 0 < max_size < max(sizes[0])):
+        return frames  # small ones need nothing, and what is not as the layout says is refused later
     _check_lenses(frames, sizes, progress)
     plans = _plans(frames, sizes, max_size)
     made = _make_all(frames, plans, Path(folder), gamma, threads, progress)
@@ -75,7 +76,7 @@ def undistorted_frames(frames, folder, max_size, gamma=None, threads=None, progr
         frames,
         intrinsics=[plan.intrinsics_for for plan in plans],
         lenses=[None] * len(plans),
-        size=plans[0].canvas if frames.size else None,
+        size=plans[0].canvas,
         **made,
     )
 
@@ -248,6 +249,8 @@ def _make(jobs, folder, known, gamma, threads, progress):
     keys = [_key(source, kind, plan, gamma) for source, _, kind, plan in jobs]
     labels = [target.relative_to(folder).as_posix() for _, target, _, _ in jobs]
     due = [i for i, (_, target, _, _) in enumerate(jobs) if known.get(labels[i]) != keys[i] or not target.is_file()]
+    if not due:
+        return
     maps, exponent = _Maps(kept=max(threads or os.cpu_count(), 1)), gamma or None
 
     def make(i):
@@ -258,13 +261,12 @@ def _make(jobs, folder, known, gamma, threads, progress):
         return i
 
     try:
-        with progress.track("undistort", max(len(due), 1)) as report, ThreadPoolExecutor(threads) as pool:
+        with progress.track("undistort", len(due)) as report, ThreadPoolExecutor(threads) as pool:
             for done, i in enumerate(pool.map(make, due)):
                 known[labels[i]] = keys[i]
                 report(done + 1)
     finally:
-        if due:
-            write_json(folder / "index.json", known)
+        write_json(folder / "index.json", known)
 
 
 def _key(source, kind, plan, gamma):
@@ -283,7 +285,9 @@ def _check_fits(path, image, plan):
     size = (image.shape[1], image.shape[0])
     if not _same_aspect(size, plan.picture):
         what = f"{size[0]} x {size[1]} px, but its image is {plan.picture[0]} x {plan.picture[1]} px"
-        raise UserError(f"{path}: this is {what}, of another shape; write it in that size, {LEAVE_OUT}")
+        turned = _same_aspect(size[::-1], plan.picture)
+        why = "turned by the image's EXIF orientation, which cameras do not know" if turned else "of another shape"
+        raise UserError(f"{path}: this is {what}, {why}; write it in that size, {LEAVE_OUT}")
 
 
 def _write(path, image):

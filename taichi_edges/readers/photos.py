@@ -1,0 +1,146 @@
+"""A folder of photographs without poses: structure from motion first, then as any COLMAP project."""
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from taichi_edges.artefacts import digest, digest_file, write_json
+from taichi_edges.errors import UserError, name_some
+from taichi_edges.photogrammetry import known_focal_length, model_files, reconstruct
+from taichi_edges.readers.colmap import frames_of_model
+from taichi_edges.readers.companions import edge_paths, is_picture, mask_folder, mask_paths
+from taichi_edges.readers.frames import Frames, is_usable
+from taichi_edges.readers.images import read_mask
+from taichi_edges.readers.picture_sizes import picture_size
+
+METHOD = 1  # raised when the same photographs give another reconstruction
+FEWEST = 3  # views; fewer show no edge surely
+MOST = 0.8  # share of the photographs that should find their place
+ADVICE = (
+    "take photographs that overlap by 60 to 80 %, sharp, of one exposure, all around, with texture in sight"
+    " (a newspaper under a plain object)"
+)
+
+
+def read_photos(folder, config):
+    """Frames of all photographs below a folder, still without poses. config: the scene's `source` section."""
+    images = folder / config.images if config.images else folder
+    names = [path.relative_to(images).as_posix() for path in _photos(images, folder, config)]
+    if not names:
+        others = sorted({path.suffix for path in images.glob("*") if path.is_file()})
+        found = f"it has files of the kinds {name_some(others)}" if others else "it is empty"
+        raise UserError(f"{images}: no PNG, JPEG or TIFF image here, {found}; convert them, or set source.path")
+    stems = [name.rpartition(".")[0] for name in names]
+    return Frames(
+        where=images,
+        names=stems if len(set(stems)) == len(stems) else names,
+        edge_paths=edge_paths(folder / config.edges, names) if config.edges else [""] * len(names),
+        image_paths=[images / name for name in names],
+        intrinsics=[None] * len(names),
+        camera_to_world=[None] * len(names),
+        opengl=False,
+        mask_paths=mask_paths(folder, config, names)[0],
+    )
+
+
+def _photos(images, folder, config):
+    """The photographs below a folder, in order; not masks, edge maps and what is hidden."""
+    if not images.is_dir():
+        raise UserError(f"{images}: no such folder; set source.path to the folder of the photographs")
+    apart = [folder / config.edges] if config.edges else []
+    apart += [masks] if (masks := mask_folder(folder, config)) else []
+    files = (path for path in images.rglob("*") if is_picture(path) and path.is_file())
+    return sorted(
+        path
+        for path in files
+        if not any(path.is_relative_to(other) for other in apart)
+        and not any(part.startswith(".") for part in path.relative_to(images).parts)
+    )
+
+
+def posed_photos(frames, folder, config, cache, seed, threads, progress):
+    """The Frames of `read_photos` with poses, from structure from motion that is done once and kept in `cache`.
+
+    folder: of edge maps and masks. config: the scene's `source` section.
+    """
+    images, names = frames.where, _whole(frames, progress)
+    if len(names) < FEWEST:
+        raise UserError(f"{images}: {len(names)} photographs are too few to find where they were taken; {ADVICE}")
+    masks = {name: path for name, path in zip(_names(frames), frames.mask_paths, strict=True) if path}
+    seen = [(name, *map(digest_file, [images / name, *([masks[name]] if name in masks else [])])) for name in names]
+    key = digest([METHOD, seed, seen])
+    record = cache / "photographs.json"
+    registered = _known(record, key, cache)
+    if registered is None:
+        progress.say(f"structure from motion from {len(names)} photographs, once")
+        groups = _by_camera(images, names, threads)
+        with TemporaryDirectory() as folder_of_masks:
+            named = _named_masks(masks, Path(folder_of_masks)) if masks else None
+            registered = reconstruct(images, names, groups, cache, seed, threads, progress, named)
+        write_json(record, {"key": key, "registered": registered})
+    _check_registered(images, names, registered, progress)
+    found = frames_of_model(folder, cache / "sparse", images, config)
+    progress.say("the edges will be in the frame of this reconstruction, whose scale and axes are its own")
+    return found
+
+
+def _named_masks(masks, folder):
+    """The masks, {name of the photograph: path}, in a folder where COLMAP finds them: PNG files `<name>.png`."""
+    import cv2
+
+    for name, path in masks.items():
+        target = folder / f"{name}.png"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(cv2.imencode(".png", np.uint8(255) * read_mask(path))[1])
+    return folder
+
+
+def _names(frames):
+    """(V,) paths of the photographs, relative to their folder."""
+    return [Path(path).relative_to(frames.where).as_posix() for path in frames.image_paths]
+
+
+def _whole(frames, progress):
+    """Names of the photographs that are whole; the others are named in a warning."""
+    names = _names(frames)
+    whole = [name for name, path in zip(names, frames.image_paths, strict=True) if is_usable(path)]
+    if len(whole) < len(names):
+        lost = [name for name in names if name not in set(whole)]
+        progress.warn(f"{len(lost)} of {len(names)} photographs are truncated, left out: {name_some(lost)}")
+    return whole
+
+
+def _known(record, key, cache):
+    """The names that an earlier run has registered from the same photographs, None where there was none."""
+    try:
+        content = json.loads(record.read_text(encoding="utf-8"))
+        registered = content["registered"] if content["key"] == key else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return registered if registered is None or not registered or model_files(cache / "sparse") else None
+
+
+def _by_camera(images, names, threads):
+    """Lists of names that share a camera: of one folder, one size, one focal length."""
+
+    def kind(name):
+        focal = known_focal_length(images / name)
+        return str(Path(name).parent), picture_size(images / name), focal and round(focal, 1)
+
+    with ThreadPoolExecutor(threads) as pool:
+        kinds = list(pool.map(kind, names))
+    return [[name for name, other in zip(names, kinds, strict=True) if other == each] for each in dict.fromkeys(kinds)]
+
+
+def _check_registered(images, names, registered, progress):
+    """UserError or a warning where too few photographs found their place, with what to do about it."""
+    lost = [name for name in names if name not in set(registered)]
+    found = f"{len(registered)} of {len(names)} photographs were found to show the same scene"
+    if len(registered) < FEWEST:
+        raise UserError(f"{images}: only {found}: {ADVICE}")
+    if lost:
+        advice = f"; {ADVICE}" if len(registered) < MOST * len(names) else ""
+        progress.warn(f"{found}, left out: {name_some(lost)}{advice}")
