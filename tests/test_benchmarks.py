@@ -118,6 +118,15 @@ def test_scaling_prints_points_and_draws(run, tmp_path):
     assert cv2.imread(str(picture)).std() > 5
 
 
+def test_scale_prints_steps_and_exponents(run):
+    text = run("benchmarks/scale.py", "--copies", 1, 2, "--windows", 1, "--threads", 2)
+    rows, exponents = read_tables(text)
+    assert [row["step"] for row in rows] == 2 * ["cluster", "fit", "refine"]
+    assert int(rows[3]["points or edges"]) == 2 * int(rows[0]["points or edges"]) > 0
+    assert all(float(row["seconds of all threads"]) > 0 for row in rows)
+    assert [row["step"] for row in exponents] == ["cluster", "fit", "refine"]
+
+
 def test_scripts_are_modules_too(run):
     assert "usage: python benchmarks/splat.py" in run("-m", "benchmarks.splat", "--help")
 

@@ -13,7 +13,7 @@ SAGITTA = 3.0  # noises that the middle of an arc is off its chord, at least; a 
 START_POINTS = 5  # aligned neighbours that a seed starts with, at least, itself included
 GROWTH = 0.5  # of an arc's length: how far beyond its ends it is looked for; a longer arc foretells more
 GROWTH_ROUNDS = 30
-BALL = 8.0 * INLIER  # noises: length of an arc about which points are looked for at once
+BALL = 16.0 * INLIER  # noises: length of an arc about which points are looked for at once
 GROWN = 1.02  # an arc that grew by less is done
 DIRECTION_NOISES = 4.0
 TURNS = np.radians([10.0, 35.0])  # a point whose direction is off by more is on another edge, whatever the noise
@@ -83,14 +83,15 @@ class Cloud:
         return around[good], along[good], squared[good]
 
     def inliers_of(self, arcs, low, high):
-        """The same for an ArcBatch: numbers of the arcs, indices of their points, ascending, and arc lengths, (t,)."""
+        """The same for an ArcBatch, with the numbers of the arcs before it: four arrays (t,), arc after arc."""
         of, around = self._near_each(arcs, low, high)
         stretched = ArcBatch(arcs.origin, arcs.tangent, arcs.bend, low, high, arcs.closed)
         along, offsets = stretched.coordinates(self.points[around], of)
-        good = ((offsets**2).sum(axis=1) / self.scale.noise**2 <= INLIER**2) & (along >= low[of]) & (along <= high[of])
-        of, around, along = of[good], around[good], along[good]
+        squared = (offsets**2).sum(axis=1) / self.scale.noise**2
+        good = (squared <= INLIER**2) & (along >= low[of]) & (along <= high[of])
+        of, around, along, squared = of[good], around[good], along[good], squared[good]
         agree = np.abs((self.directions[around] * arcs.tangents(along, of)).sum(axis=1)) >= self.scale.cosine
-        return of[agree], around[agree], along[agree]
+        return of[agree], around[agree], along[agree], squared[agree]
 
     def _near_each(self, arcs, low, high):
         """Numbers of the arcs, and indices of the points about them, (t,); some farther ones are among them."""
@@ -99,10 +100,11 @@ class Cloud:
         of = np.repeat(np.arange(len(arcs)), counts)
         place = np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts, counts)
         step = (high - low) / counts
-        centres = cKDTree(arcs.at((low + 0.5 * step)[of] + step[of] * place, of))
-        reach = np.hypot(0.5 * step.max(initial=0.0), INLIER * self.scale.noise) * (1 + 1e-9)
-        pairs = centres.sparse_distance_matrix(self.tree, reach, output_type="ndarray")
-        keys = np.unique(of[pairs["i"]] * len(self.points) + pairs["j"])
+        centres = arcs.at((low + 0.5 * step)[of] + step[of] * place, of)
+        radius = np.hypot(0.5 * step, INLIER * self.scale.noise)[of] * (1 + 1e-9)
+        found = self.tree.query_ball_point(centres, radius, return_sorted=False)
+        around = np.fromiter(itertools.chain.from_iterable(found), np.int64)
+        keys = np.unique(np.repeat(of, [len(some) for some in found]) * len(self.points) + around)
         return keys // len(self.points), keys % len(self.points)
 
 
@@ -111,7 +113,7 @@ def grow_arcs(cloud, arcs, straight):
     scale, best, found, active = cloud.scale, arcs, np.zeros(len(arcs), bool), np.arange(len(arcs))
     for _ in range(GROWTH_ROUNDS if len(arcs) else 0):
         ahead = np.maximum(GROWTH * arcs.length, INLIER * scale.noise)
-        of, members, along = cloud.inliers_of(arcs, arcs.low - ahead, arcs.high + ahead)
+        of, members, along, _ = cloud.inliers_of(arcs, arcs.low - ahead, arcs.high + ahead)
         inside = all_unbroken(of, along, arcs.low, arcs.high, np.minimum(ahead, scale.gap))
         enough = np.bincount(of[inside], minlength=len(arcs)) >= START_POINTS
         inside &= enough[of]

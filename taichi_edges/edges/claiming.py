@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from taichi_edges.edges.arc_batch import ArcBatch
 from taichi_edges.edges.arc_growth import INLIER, grown_from_seeds, unbroken
 from taichi_edges.edges.arcs import Arc, fit_arc
 
@@ -18,10 +19,11 @@ OUTLIER = INLIER**2  # squared noises: what a point on an edge brings at most
 LINE_PRICE, ARC_PRICE = 5, 8  # free parameters: a line and where it ends; an arc, which has a plane and a bend as well
 OWN_SHARE = 0.5  # of the points along a stretch, which must be an arc's own: elsewhere it repeats another
 LEAST_DENSITY = 4.0  # own points on the length of a gap, on average; strays line up by chance, but not so closely
-COVERED = 1.0  # times the tolerance: a point so near to what has grown needs no growth of its own in this round
 ROUNDS, COARSER = 3, 2.0  # of claiming, and from the noise of one to that of the next
 MOST_NOISE = 2e-3  # unit-cube units; coarser rounds would claim neighbouring edges (the paper's lines take 5e-3)
-AT_ONCE = 512  # seeds from which arcs are grown together
+LEAST_AT_ONCE, MOST_AT_ONCE = 16, 512  # seeds from which arcs are grown together
+USED = 0.7  # of the arcs of one such batch, for the next to be larger
+WINDOW = 8192  # seeds among which these are looked for
 TAIL = 0.7  # of the gap: an edge goes on past its sharp points in steps of that size at most
 
 
@@ -72,16 +74,15 @@ def claims(cloud, neighbors, seeds, min_points):
 def claim_round(cloud, neighbors, seeds, min_points, ledger, found):
     """Add to the Claims in `found`, and to the Ledger, what can be claimed at the cloud's scale."""
     waiting, owner = [], ledger.owner
-    for number, arc in enumerate(candidates(cloud, neighbors, seeds, min_points, owner)):
-        gain, _ = supported(cloud, arc, owner, min_points)
-        heapq.heappush(waiting, (-gain, number, arc))
+    for number, (gain, *candidate) in enumerate(candidates(cloud, neighbors, seeds, min_points, owner)):
+        heapq.heappush(waiting, (-gain, number, *candidate))
     while waiting:
-        _, number, arc = heapq.heappop(waiting)
-        gain, claim = supported(cloud, arc, owner, min_points)
+        _, number, *candidate = heapq.heappop(waiting)
+        gain, claim = supported(cloud, *candidate, owner, min_points)
         if gain <= 0:
             continue
         if waiting and gain < -waiting[0][0]:  # others have claimed its points: let it wait for its new turn
-            heapq.heappush(waiting, (-gain, number, arc))
+            heapq.heappush(waiting, (-gain, number, *candidate))
             continue
         ledger.enter(claim.own, len(found), cloud.scale.noise)
         found.append(claim)
@@ -119,42 +120,60 @@ def refined(cloud, claim, ledger):
 
 
 def candidates(cloud, neighbors, seeds, min_points, owner):
-    """Arcs grown from seeds until every point that nobody owns is near one, or has grown none."""
+    """Gains, Arcs and `Cloud.inliers` of these: grown from seeds until every point that nobody owns is on one.
+
+    Or has grown none.
+    """
     covered = owner >= 0
-    for seed, pair in grown_pairs(cloud, neighbors, seeds, covered):
+    for seed, grown in grown_pairs(cloud, neighbors, seeds, covered):
         covered[seed] = True
-        grown = [arc for arc in pair if arc is not None]
-        gains = [supported(cloud, arc, owner, min_points)[0] for arc in grown]
-        for arc, gain in zip(grown, gains, strict=True):
+        gains = [supported(cloud, arc, inliers, owner, min_points)[0] for arc, inliers in grown]
+        for (arc, inliers), gain in zip(grown, gains, strict=True):
             if gain == max(gains):  # even where it is too short to be claimed: its points will not do better
-                covered[cloud.inliers(arc, arc.low, arc.high, COVERED * INLIER)[0]] = True
+                covered[inliers[0]] = True
             if gain > 0:
-                yield arc
+                yield gain, arc, inliers
 
 
 def grown_pairs(cloud, neighbors, seeds, covered):
-    """(seed, its line and arc) of one seed after the other that is not covered when its turn comes.
+    """(seed, [(Arc, its `Cloud.inliers`)]) of one seed after the other that is not covered when its turn comes.
 
-    covered: (n,) bool, which changes meanwhile. Arcs are grown AT_ONCE; those of seeds that are covered by then are
-    dropped.
+    covered: (n,) bool, which changes meanwhile. Arcs of seeds that are covered by then are dropped; where that were
+    many, fewer are grown at once the next time.
     """
-    first = 0
+    first, count = 0, LEAST_AT_ONCE
     while first < len(seeds):
-        waiting = seeds[first:]
-        waiting = np.flatnonzero(~covered[waiting])[:AT_ONCE]
-        some = seeds[first + waiting]
-        for seed, pair in zip(some.tolist(), grown_from_seeds(cloud, neighbors, some), strict=True):
+        waiting = first + np.flatnonzero(~covered[seeds[first : first + WINDOW]])[:count]
+        first = int(waiting[-1]) + 1 if len(waiting) == count else first + WINDOW
+        some = seeds[waiting]
+        pairs = [[arc for arc in pair if arc is not None] for pair in grown_from_seeds(cloud, neighbors, some)]
+        inliers = iter(inliers_of_each(cloud, [arc for pair in pairs for arc in pair]))
+        used = 0
+        for seed, pair in zip(some.tolist(), pairs, strict=True):
+            grown = [(arc, next(inliers)) for arc in pair]
             if not covered[seed]:
-                yield seed, pair
-        first += int(waiting[-1]) + 1 if len(waiting) else len(seeds)
+                used += 1
+                yield seed, grown
+        count = min(2 * count, MOST_AT_ONCE) if used >= USED * len(some) else max(count // 2, LEAST_AT_ONCE)
 
 
-def supported(cloud, arc, owner, min_points):
+def inliers_of_each(cloud, arcs):
+    """`Cloud.inliers` of each of some Arcs on its whole length, a list."""
+    if not arcs:
+        return []
+    batch = ArcBatch.of(arcs)
+    of, *columns = cloud.inliers_of(batch, batch.low, batch.high)
+    bounds = np.searchsorted(of, np.arange(1, len(arcs)))
+    return list(zip(*(np.split(column, bounds) for column in columns), strict=True))
+
+
+def supported(cloud, arc, inliers, owner, min_points):
     """What an arc gains by the points that nobody owns, net of its price; and its Claim on them.
 
-    A stretch counts where most points along it are its own. Shared points carry it across a contact, no farther.
+    inliers: `Cloud.inliers` of the arc on its whole length. A stretch counts where most points along it are its own.
+    Shared points carry it across a contact, no farther.
     """
-    members, along, squared = cloud.inliers(arc, arc.low, arc.high)
+    members, along, squared = inliers
     own = owner[members] < 0
     if own.sum() < min_points:
         return 0.0, None
