@@ -29,7 +29,7 @@ def parse_arguments(arguments=None):
     parser.add_argument("--out", metavar="FOLDER", default="runs", help="results go to FOLDER/<scene> (default: runs)")
     parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="e.g. --set train.epochs=100")
     parser.add_argument("--preset", choices=("fast", "paper"), help="training schedule (default: the scene's, or fast)")
-    parser.add_argument("--scale", choices=("object", "building", "room"), help="settings for a scene of this size")
+    parser.add_argument("--scale", choices=("part", "object", "building", "room"), help="settings for such a scene")
     parser.add_argument("--seed", type=int, help="seed of every random choice (default: the scene's)")
     parser.add_argument("--threads", type=int, help="CPU threads (default: all this process may use)")
     parser.add_argument("--arch", choices=("cpu", "cuda", "vulkan"), default="cpu", help="where the kernels run")

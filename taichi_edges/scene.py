@@ -309,7 +309,9 @@ class SceneConfig(Section):
 
     name: Name = Field("scene", description="folder of the results; the file's name unless set")
     preset: Literal["fast", "paper"] = Field("fast", description="the schedule the scene starts from")
-    scale: Literal["object", "building", "room"] = Field("object", description="settings for scenes of this size")
+    scale: Literal["part", "object", "building", "room"] = Field(
+        "part", description="settings for a part without texture, a photographed object, what surrounds the camera"
+    )
     seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of every random choice")
     box: Annotated[Box, WrapValidator(_auto_or), PlainSerializer(lambda box: box)] = Field(
         "auto", description="opposite corners of the scene, input units; auto: the layout's, else the unit cube"
@@ -430,10 +432,15 @@ PHOTOGRAPHED = {
         "grow": 0.0,
     },
     "cluster": {"min_points": 5, "max_gap": 0.015},
-    "refine": {"anchor": True, "min_support": 0.15, "min_views": 2.0, "min_steadiness": 0.3},
+    "refine": {"min_support": 0.15, "min_views": 2.0, "min_steadiness": 0.3},
 }
+# Photographers walk along facades, so that the depth of horizontal edges is for others to tell.
+SURROUNDING = {**PHOTOGRAPHED, "refine": {**PHOTOGRAPHED["refine"], "anchor": True}}
 SCALES = {
-    "object": {"paper": {}, "fast": {}},
-    "building": {"paper": LARGE_IN_THE_PAPER, "fast": PHOTOGRAPHED},
-    "room": {"paper": LARGE_IN_THE_PAPER, "fast": PHOTOGRAPHED},
+    "part": {"paper": {}, "fast": {}},
+    "object": {"paper": {}, "fast": PHOTOGRAPHED},
+    "building": {"paper": LARGE_IN_THE_PAPER, "fast": SURROUNDING},
+    "room": {"paper": LARGE_IN_THE_PAPER, "fast": SURROUNDING},
 }
+# What a scene is taken for that does not say: photographs are read by these readers.
+SCALES_OF_READERS = {"idr": "object", "colmap": "building", "images": "building", "nerfstudio": "building"}

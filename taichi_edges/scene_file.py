@@ -12,7 +12,7 @@ import yaml
 from pydantic import ValidationError
 
 from taichi_edges.errors import UserError, did_you_mean
-from taichi_edges.scene import PRESETS, SCALES, SceneConfig, Section
+from taichi_edges.scene import PRESETS, SCALES, SCALES_OF_READERS, SceneConfig, Section
 
 LISTING_SUFFIXES = (".json", ".npz", ".bin", ".txt")  # of files that list the views of a source
 
@@ -86,6 +86,7 @@ def load_scene(path, preset=None, settings=(), seed=None, scale=None):
     content = _folder_content(path) if is_source(path) else _file_content(path)
     _refuse_unknown("preset", preset, PRESETS)
     _refuse_unknown("scale", scale, SCALES)
+    content = {**_scale_of_reader(content), **content}
     content = overlay(_starting_values(content.get("preset"), scale or content.get("scale")), content)
     content = _overridden(content, preset, scale)
     origins = {}
@@ -101,6 +102,14 @@ def load_scene(path, preset=None, settings=(), seed=None, scale=None):
     return check_scene(content, path, origins)
 
 
+def _scale_of_reader(content):
+    """{'scale': ...} for a scene of photographs, as its reader tells; {} for others."""
+    source = content.get("source")
+    reader = source.get("reader") if isinstance(source, dict) else None
+    scale = SCALES_OF_READERS.get(reader) if isinstance(reader, str) else None
+    return {} if scale is None else {"scale": scale}
+
+
 def is_source(path):
     """Whether what was given in place of a scene file is the source itself: a folder, or a file that lists views."""
     return path.is_dir() or (path.suffix.lower() in LISTING_SUFFIXES and path.is_file())
@@ -108,9 +117,10 @@ def is_source(path):
 
 def _folder_content(path):
     """The scene that a folder without a scene file is: its own path and name, everything else as by default."""
-    from taichi_edges.readers.recognition import scene_name
+    from taichi_edges.readers.recognition import recognise, scene_name
 
-    return {"name": scene_name(path), "source": {"reader": "auto", "path": str(path.resolve())}}
+    scale = SCALES_OF_READERS.get(recognise(path).reader, "part")
+    return {"name": scene_name(path), "scale": scale, "source": {"reader": "auto", "path": str(path.resolve())}}
 
 
 def _file_content(path):

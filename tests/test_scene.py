@@ -402,7 +402,7 @@ def test_a_scale_on_the_command_line_replaces_that_of_the_scene(scene):
 
 
 def test_an_unknown_scale_is_refused(scene):
-    assert "scale: must be 'object', 'building' or 'room', not 'city'" in refusal(scene("scale: city"))
+    assert "scale: must be 'part', 'object', 'building' or 'room', not 'city'" in refusal(scene("scale: city"))
     assert "scale: must be" in refusal(scene("scale: [room]"))
-    assert refusal(scene(), scale="city").startswith("--scale city: there is no such scale; there is object, building")
+    assert refusal(scene(), scale="city").startswith("--scale city: there is no such scale; there is part, object")
     assert "use --scale room" in refusal(scene(), settings=["scale=room"])

@@ -113,8 +113,9 @@ class Support:
     """The edgels of all views that are matched by the samples of some edges and owned by these.
 
     samples: Samples. edgels: (n, V) index, -1 where there is none. residuals: (n, V) px. weights: (n, V) strength of
-    the edgel times closeness, that of Geman and McClure at the scale of the matching; 0 where there is none. claims: Claims. chance:
-    sum of the weights that a place would have by chance. least_views: that must show an edge, each counted by its weight.
+    the edgel times closeness, that of Geman and McClure at the scale of the matching; 0 where there is none. claims:
+    Claims. chance: sum of the weights that a place would have by chance. least_views: that must show an edge, each
+    counted by its weight.
     """
 
     samples: Samples

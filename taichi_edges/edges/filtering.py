@@ -14,8 +14,8 @@ from taichi_edges.support import exclusive_support
 
 AROUND = 9  # points, itself included, over which the steadiness of a point is a median
 CONTINUED = 0.5  # views that may be fewer where an edge goes on
-# An edge that fewer views see than so many times the least must be seen from different directions, 15 degrees apart from their mean: neighbouring
-# views see an occluding contour in one place as well.
+# An edge that fewer views see than so many times the least must be seen from different directions: neighbouring views
+# see an occluding contour in one place as well.
 FEW_VIEWS = 2.0
 RARE = 0.8  # of a harvested point's support, which those that continue it need
 HARVEST_KEEP = 0.06  # share of the views that must see one of the edges left over

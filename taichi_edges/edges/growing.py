@@ -18,7 +18,8 @@ MOST_ROUNDS = 200
 def grow_points(matching, refined, least, step_px=1.0):
     """RefinedPoints and the points that continue them, each the step after another.
 
-    matching: EdgelMatching. least: (n,) share of the views that the points which continue each of them need. step_px: of a step.
+    matching: EdgelMatching. least: (n,) share of the views that the points which continue each of them need.
+    step_px: of a step.
     """
     step, newest = step_px * matching.pixel, refined
     for _ in range(MOST_ROUNDS):

@@ -25,6 +25,7 @@ RING_COLOUR = (255, 255, 255)  # inside
 RING_SIDES = 16
 FADED_TO = 0.35  # how dark an edge pixel of the map is drawn, 1 = black
 IMAGE_FADE = 0.35  # how far the colour image is mixed with white, so that the edges stand out
+MANY_EDGES, THINNEST = 100, 0.4  # from so many edges on strokes get thinner, down to this share
 REFERENCE_WIDTH = 800  # pixels; strokes and letters grow with wider images
 SHEET_WIDTH = 1600  # pixels; a contact sheet is scaled down to this
 SHEET_GAP = 8  # pixels
@@ -106,7 +107,7 @@ def draw_edges(picture, projection, wireframe):
     projection: (3, 4) intrinsics @ world_to_camera. wireframe: in the world of the projection.
     """
     height, width = picture.shape[:2]
-    stroke = LINE_WIDTH * max(width / REFERENCE_WIDTH, 0.5)
+    stroke = LINE_WIDTH * max(width / REFERENCE_WIDTH, 0.5) * _thinness(len(wireframe))
     points, segments, owners = line_set_arrays(wireframe)
     homogeneous = points @ projection[:, :3].T + projection[:, 3]
     planes = frustum_planes(width, height, margin=2 * stroke)
@@ -121,6 +122,11 @@ def draw_edges(picture, projection, wireframe):
     for ring, which in ((False, degrees > 1), (True, degrees == 1)):
         _mark(picture, _pixels(vertices[visible & which]), stroke, ring)
     return picture
+
+
+def _thinness(count):
+    """Factor on the strokes: where there are many edges they would hide each other."""
+    return max(THINNEST, min(1.0, (MANY_EDGES / max(count, 1)) ** 0.5))
 
 
 def _pixels(homogeneous):

@@ -48,7 +48,8 @@ class EdgelMatching:
     """Matches points that know their direction with the edgels of all views.
 
     edgels: those of the views. pixel: size of a pixel at the scene, unit-cube units. scale_px: residual at which the
-    weight of an edgel has fallen to a quarter. least_views: that show an edge which goes on, each counted by its weight.
+    weight of an edgel has fallen to a quarter. least_views: that show an edge which goes on, each counted by
+    its weight.
     """
 
     def __init__(self, views, least_views=LEAST_VIEWS):

@@ -194,7 +194,7 @@ def camera_centres(views):
 
 
 def sweep_view(views, view, chosen, others, maps):
-    """Candidate points (k, 3), directions (k, 3), numbers of views (k,), pixel sizes (k,) of the chosen edgels of one view."""
+    """Candidate points (k, 3), directions (k, 3), counts of views (k,), pixel sizes (k,) of the chosen edgels."""
     pixels, normals, _ = views.edgels.of_view(view)
     pixels, normals = pixels[chosen].astype(np.float64), normals[chosen].astype(np.float64)
     lens, pose = views.intrinsics[view], views.world_to_camera[view]
