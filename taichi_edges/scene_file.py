@@ -119,7 +119,11 @@ def _folder_content(path):
     """The scene that a folder without a scene file is: its own path and name, everything else as by default."""
     from taichi_edges.readers.recognition import recognise, scene_name
 
-    scale = SCALES_OF_READERS.get(recognise(path).reader, "part")
+    try:
+        reader = recognise(path).reader
+    except UserError:  # the stage that reads it says so, with what it needs
+        reader = "auto"
+    scale = SCALES_OF_READERS.get(reader, "part")
     return {"name": scene_name(path), "scale": scale, "source": {"reader": "auto", "path": str(path.resolve())}}
 
 

@@ -103,11 +103,11 @@ def test_the_assembly_is_left_without_contours(generator):
         np.repeat([0, 1], 40), np.array([[0, 1], [79, 0]]), np.arange(2.0)[:, None] * np.ones(ARC_NUMBERS)
     )
     explained = explain(matching, found)
-    kept, contours = without_contours(assembly, found.points, found.directions, explained, views, LEAST)
+    kept, contours = without_contours(assembly, found.points, found.directions, explained, views, FilterConfig())
     assert contours == 1 and kept.arcs[:, 0].tolist() == [1.0]
     np.testing.assert_array_equal(kept.labels, np.repeat([-1, 0], 40))
     np.testing.assert_array_equal(kept.shared, [[0, 0]])
-    untouched, contours = without_contours(assembly, found.points, found.directions, None, views, LEAST)
+    untouched, contours = without_contours(assembly, found.points, found.directions, None, views, FilterConfig())
     assert untouched is assembly and contours == 0
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_edges.cameras import OPENGL_TO_OPENCV, Similarity, invert_pose
+from taichi_edges.cameras import OPENGL_TO_OPENCV, Similarity, inside_image, invert_pose, project
 from taichi_edges.errors import UserError, did_you_mean, name_some
 from taichi_edges.photogrammetry import undistorted
 from taichi_edges.progress import Progress

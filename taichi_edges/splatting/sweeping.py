@@ -16,10 +16,8 @@ from scipy.spatial import cKDTree
 from taichi_edges.cameras import NEAR, inside_image, project
 from taichi_edges.detectors.chains import chain_lengths
 from taichi_edges.kernels.device import download, upload
-from taichi_edges.kernels.edgel_matching import EdgelMatching
 from taichi_edges.kernels.points import F32_1D, F32_2D, I32_1D, I32_2D, U8_3D
 from taichi_edges.splatting.gaussians import orient_gaussians
-from taichi_edges.viewing_planes import refine_points
 from taichi_edges.views import pixel_size
 
 EVERY_PX = 8  # one edgel in each cell of this size is a reference
