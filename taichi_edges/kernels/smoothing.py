@@ -46,10 +46,11 @@ def with_smooth_normals(edgels, height, width, rounds=2):
     for _ in range(rounds if len(edgels) else 0):
         grid = EdgelGrid(edgels, height, width)
         inside = np.clip(np.floor(edgels.points / CELL).astype(np.int64), 0, [grid.columns - 1, grid.rows - 1])
-        cells = ((edgels.views * grid.rows + inside[:, 1]) * grid.columns + inside[:, 0])[grid.order]
+        order = grid.order[: len(edgels)]
+        cells = ((edgels.views * grid.rows + inside[:, 1]) * grid.columns + inside[:, 0])[order]
         found = upload(np.zeros((len(edgels), 2), np.float32))
         measure_normals(grid.rows, grid.columns, grid.starts, upload(cells.astype(np.int32)), grid.elements, found)
         normals = np.empty((len(edgels), 2), np.float32)
-        normals[grid.order] = download(found)
+        normals[order] = download(found)
         edgels = replace(edgels, normals=normals)
     return edgels
