@@ -21,6 +21,7 @@ from taichi_edges.artefacts import digest, digest_file, replacing, write_json
 from taichi_edges.detectors.pictures import light_of_srgb, srgb_of_light
 from taichi_edges.errors import UserError
 from taichi_edges.photogrammetry import Lens, distorted_pixels, undistorted
+from taichi_edges.progress import Progress
 from taichi_edges.readers.frames import LEAVE_OUT, is_usable, refuse_views
 from taichi_edges.readers.picture_sizes import picture_size
 
@@ -60,7 +61,7 @@ class Plan:
         return np.array(self.intrinsics)
 
 
-def undistorted_frames(frames, folder, max_size, gamma=None, threads=None, progress=None):
+def undistorted_frames(frames, folder, max_size, gamma=None, threads=None, progress=Progress()):
     """Frames whose pictures pinhole cameras took, all of one size; written to `folder` where they were not.
 
     max_size: px of the longest side from which on photographs are made smaller, 0: never. gamma: see `as_picture`.
@@ -108,7 +109,7 @@ def _check_lenses(frames, sizes, progress):
     refuse_views(frames, turned, f"{problem}, {cure}, or export both again, {LEAVE_OUT}")
     refuse_views(frames, wrong, f"{problem}, of another shape; use the images that the cameras are of, {LEAVE_OUT}")
     resized = [pair for pair in pairs if pair[0] != pair[1]]
-    if resized and progress:
+    if resized:
         size, lens = resized[0]
         what = f"images of {size[0]} x {size[1]} px for cameras of {lens[0]} x {lens[1]} px"
         progress.say(f"{len(resized)} of {len(pairs)} views have {what}: the intrinsics are scaled to them")
