@@ -47,28 +47,43 @@ def test_normals_of_a_line(generator, angle):
         views.append(noisy(points, angles, generator))
         truth.append(angles)
     off = errors(with_smooth_normals(Edgels.of_views(views), SIZE, SIZE).normals, np.concatenate(truth))
-    # Slope through 17 edgels: 0.15 px / sqrt(17^3 / 12) is 0.43 degrees; at the ends 9 on one side: 1.1 degrees.
+    # Slope through 17 edgels: 0.15 px / sqrt(17^3 / 12) is 0.43 degrees; at the ends 9 to one side: 2 degrees.
     inner = np.tile(np.abs(np.arange(81) - 40) <= 32, 8)
     assert np.sqrt((off[inner] ** 2).mean()) < 0.9 and np.quantile(np.abs(off[inner]), 0.99) < 3.0
-    assert np.sqrt((off**2).mean()) < 1.0 and abs(off.mean()) < 0.2
+    assert np.sqrt((off**2).mean()) < 1.2 and abs(off.mean()) < 0.3
 
 
 def test_normals_of_a_circle_are_unbiased(generator):
     angles = np.degrees(np.arange(0, 2 * np.pi, 1 / 40))
     views = [noisy(generator.uniform(110, 130, 2) + 40 * unit(angles), angles, generator) for _ in range(6)]
     off = errors(with_smooth_normals(Edgels.of_views(views), SIZE, SIZE).normals, np.tile(angles, 6))
-    assert np.sqrt((off**2).mean()) < 1.5 and np.quantile(np.abs(off), 0.9) < 3.0
+    assert np.sqrt((off**2).mean()) < 1.0 and np.quantile(np.abs(off), 0.97) < 3.0
     assert abs(off.mean()) < 0.15  # 0.5 degrees each, over some 1500 that share their neighbours with 17
 
 
+def test_tight_bends_are_not_straightened(generator):
+    angles = np.degrees(np.arange(0, 2 * np.pi, 1 / 25))
+    views = [noisy(generator.uniform(110, 130, 2) + 25 * unit(angles), angles, generator) for _ in range(6)]
+    edgels, truth = Edgels.of_views(views), np.tile(angles, 6)
+    off = errors(with_smooth_normals(edgels, SIZE, SIZE).normals, truth)
+    assert np.sqrt((off**2).mean()) < 0.75 * np.sqrt((errors(edgels.normals, truth) ** 2).mean())
+
+
+def test_ends_of_bends_are_no_chords(generator):
+    angles = np.degrees(np.arange(60) / 40)
+    views = [noisy(generator.uniform(110, 130, 2) + 40 * unit(angles), angles, generator, 0.05) for _ in range(20)]
+    off = errors(with_smooth_normals(Edgels.of_views(views), SIZE, SIZE).normals, np.tile(angles, 20)).reshape(20, 60)
+    assert np.abs(off[:, [0, -1]].mean(axis=0)).max() < 0.8 * np.degrees(4 / 40)  # of the chord of the last 8 px
+
+
 def test_corners_are_not_mixed(generator):
-    along, rising = np.arange(1, 41)[:, None], np.arange(1, 41)[:, None]
-    corner = np.array([100.0, 100.0])
-    points = np.concatenate([corner + along * unit(0.0), corner + rising * unit(75.0)])
-    angles = np.repeat([90.0, 165.0], 40)
-    off = errors(with_smooth_normals(Edgels.of_views([noisy(points, angles, generator)]), SIZE, SIZE).normals, angles)
-    # At a corner nine edgels on one side say 1.1 degrees; one of the other arm, 20 px long, would turn that by more.
-    assert np.abs(off).max() < 4.5 and np.sqrt((off**2).mean()) < 1.2
+    along, corner = np.arange(1, 41)[:, None], np.array([100.0, 100.0])
+    arms = [noisy(corner + along * unit(arm), np.full(40, arm + 90.0), generator) for arm in (0.0, 75.0)]
+    points, normals, strengths = (np.concatenate(columns) for columns in zip(*arms, strict=True))
+    together = with_smooth_normals(Edgels.of_views([(points, normals, strengths)]), SIZE, SIZE).normals
+    alone = [with_smooth_normals(Edgels.of_views([arm]), SIZE, SIZE).normals for arm in arms]
+    np.testing.assert_allclose(together, np.concatenate(alone), atol=1e-6)  # but for the order of sums
+    assert np.sqrt((errors(together, np.repeat([90.0, 165.0], 40)) ** 2).mean()) < 1.8
 
 
 def test_parallel_edges_are_not_mixed(generator):
@@ -103,6 +118,8 @@ def test_edgels_with_few_around_keep_their_normals(generator):
     points, angles = np.concatenate([points, lonely[0]]), np.concatenate([angles, lonely[1]])
     edgels = Edgels.of_views([noisy(points, angles, generator, noise=0.0)])
     np.testing.assert_array_equal(with_smooth_normals(edgels, SIZE, SIZE).normals, edgels.normals)
+    repeated = Edgels.of_views([noisy(np.full((9, 2), 50.0), np.full(9, 30.0), generator, noise=0.0, turned=0.0)])
+    np.testing.assert_array_equal(with_smooth_normals(repeated, SIZE, SIZE).normals, repeated.normals)
     none = Edgels.of_views([(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))])
     assert len(with_smooth_normals(none, SIZE, SIZE)) == 0
 
