@@ -1,7 +1,8 @@
-"""Makes the README's pictures from finished runs: `python docs/make_pictures.py RUN_FOLDER VIEW OUT.png`.
+"""Makes the README's pictures from finished runs: `python docs/make_pictures.py RUN_FOLDER VIEW[,VIEW ...] OUT.png`.
 
 Panels of one view, cropped to the scene: the edge map the training saw, the oriented points coloured by cluster, and
-the edges over the view's picture. Edge maps and pictures are shown only where the run has rendered them itself.
+the edges over the view's picture. Edge maps and pictures are shown only where the run has rendered them itself. Of
+several views, as of a building, the edges alone, in full.
 """
 
 import sys
@@ -18,7 +19,7 @@ from taichi_edges.exporters.palette import label_colours
 from taichi_edges.views import read_views
 from taichi_edges.wireframe import read_wireframe
 
-PANEL = 420  # px
+PANEL, WIDE_PANEL = 420, 760  # px
 MARGIN = 0.08  # of the panel, around the edges
 
 
@@ -40,9 +41,26 @@ def draw_points(shape, pixels, colours):
     return picture
 
 
+def draw_views(folder, names, out):
+    """Write the edges of the run in `folder` as each of the named views sees them, side by side."""
+    views = read_views(folder / "views.npz")
+    wireframe, _ = read_wireframe(folder / "edges.json")
+    wireframe = wireframe.transformed(views.similarity.to_unit, views.similarity.scale)
+    panels = []
+    for name in names:
+        view = views.names.index(name)
+        canvas = np.full((views.height, views.width, 3), 255, np.uint8)
+        drawn = draw_edges(canvas, views.intrinsics[view] @ views.world_to_camera[view], wireframe)
+        height = round(WIDE_PANEL * views.height / views.width)
+        panels.append(cv2.resize(drawn, (WIDE_PANEL, height), interpolation=cv2.INTER_AREA))
+    cv2.imwrite(str(out), np.hstack(panels))
+
+
 def main(folder, view_name, out):
     """Write the picture of one view of the run in `folder`."""
     folder = Path(folder)
+    if "," in view_name:
+        return draw_views(folder, view_name.split(","), out)
     views = read_views(folder / "views.npz")
     view = views.names.index(view_name)
     wireframe, _ = read_wireframe(folder / "edges.json")

@@ -403,7 +403,7 @@ def _start(run, views, generator):
         if seeds == "votes":
             found = voted_gaussians(views, config.edge_threshold, config.gaussians, config.initial_opacity, generator)
         else:
-            found = swept_gaussians(views, config.gaussians, config.initial_opacity, generator, run.progress)
+            found = swept_gaussians(views, config.gaussians, config.initial_opacity, run.progress)
         if found is not None:
             return found
         seeds = "points" if run.path("seeds.ply").is_file() else "random"

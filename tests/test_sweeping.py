@@ -15,6 +15,8 @@ from taichi_edges.scene import SceneConfig
 from taichi_edges.splatting import sweeping
 from taichi_edges.splatting.sweeping import (
     LEAST_COMPANIONS,
+    SweepSeeds,
+    best_seeds,
     companions_of,
     direction_maps,
     neighbor_views,
@@ -166,19 +168,40 @@ def test_no_edgels_and_no_long_chains_give_nothing(taichi, generator):
     short = cluttered(without_edgels(8), generator, strokes=50, length=sweeping.LEAST_CHAIN // 2)
     chosen = references(short.edgels, sweeping.chain_lengths(short.edgels))
     assert chosen.mean() < 0.2 and len(good(sweep_seeds(short))[0]) < 5
-    assert swept_gaussians(without_edgels(8), 1000, 0.3, generator, Progress()) is None
+    assert swept_gaussians(without_edgels(8), 1000, 0.3, Progress()) is None
 
 
 def test_gaussians_lie_along_edges_at_most_so_many(taichi, generator):
     views = views_of(CURVES, generator, noise_px=0.1)
     pixel = pixel_size(views)
-    gaussians = swept_gaussians(views, 10_000, 0.3, np.random.default_rng(0), Progress())
+    gaussians = swept_gaussians(views, 10_000, 0.3, Progress())
     assert gaussians.scales[0] == pytest.approx(np.array([2.0, 0.7, 0.7]) * pixel, rel=1e-5)
     assert gaussians.opacities == pytest.approx(0.3)
     away, which = misses(gaussians.means.astype(float), CURVES, pixel)
     assert (away < 2).mean() > 0.8 and set(which) == {0, 1, 2, 3}  # strays are thinned less than what lies on edges
-    fewer = [swept_gaussians(views, 100, 0.3, np.random.default_rng(0), Progress()) for _ in range(2)]
-    assert len(fewer[0]) == 100 and fewer[0].means.tobytes() == fewer[1].means.tobytes()
+    fewer = swept_gaussians(views, 100, 0.3, Progress())
+    assert len(fewer) == 100 and set(map(bytes, fewer.means)) < set(map(bytes, gaussians.means))
+
+
+def test_best_seeds_have_most_companions_and_there_is_room_for_them(generator):
+    views, count = blank_views(8), 3000
+    pixel = pixel_size(views)
+    points = 0.4 + generator.random((count, 3)) * 0.2  # in the images of all views
+    companions = generator.integers(0, 20, count)
+    along = np.tile([1.0, 0, 0], (count, 1))
+    seeds = SweepSeeds(points, along, np.full(count, 4), companions, np.full(count, pixel), references=300)
+    chosen = best_seeds(seeds, views, count)
+    cells = np.floor(points / (sweeping.THINNED_PX * pixel)).astype(int)
+    assert len(np.unique(cells[chosen], axis=0)) == len(chosen)
+    # 300 references of 8 px each, each place in the sight of 8 views: 300 px of edges, a seed every 3 px; twice that.
+    assert len(chosen) == 2 * 300 * 8 / 3 / 8
+    best = {}
+    for cell, number in zip(map(tuple, cells.tolist()), companions):
+        best[cell] = max(best.get(cell, 0), number)
+    expected = np.sort(list(best.values()))[::-1][: len(chosen)]
+    np.testing.assert_array_equal(np.sort(companions[chosen])[::-1], expected)
+    assert len(best_seeds(seeds, views, 70)) == 70
+    assert len(best_seeds(replace(seeds, companions=np.zeros(count, int)), views, 70)) == 0
 
 
 def test_neighbours_see_the_same_from_elsewhere():

@@ -1,8 +1,8 @@
 """Normals of edgels from the places of those around them.
 
 A parabola is laid through the edgels around each. A straight line would do where there are as many to one side as to
-the other; at the ends of bent edges it would be a chord. Noise of 0.15 px in the 17 edgels within 8 px turns a normal by
-0.4 degrees; that of a single edgel may be off by several.
+the other; at the ends of bent edges it would be a chord. Noise of 0.15 px in the 17 edgels within 8 px turns a normal
+by 0.4 degrees; that of a single edgel may be off by several.
 """
 
 from dataclasses import replace

@@ -40,12 +40,15 @@ LEAST_COMPANIONS = 2  # of a seed
 SEARCHED = 20_000  # candidates whose companions are looked for at the same time
 THINNED_PX = 3.0  # one seed in each cell of this size
 BATCH_BYTES = 64 << 20  # distances from edgels that are kept at the same time
+MARGIN = 2.0  # times the seeds that there is room for: some are false
+SIGHTED = 2000  # seeds that tell how many views see a place
 
 
 @dataclass(frozen=True)
 class SweepSeeds:
     """points, directions: (n, 3) unit cube. views: (n,) that agree, the reference included. companions: (n,) see
-    `companions_of`. pixel: (n,) size of a pixel at each point, unit-cube units.
+    `companions_of`. pixel: (n,) size of a pixel at each point, unit-cube units. references: number of edgels whose rays
+    were swept.
     """
 
     points: np.ndarray
@@ -53,6 +56,7 @@ class SweepSeeds:
     views: np.ndarray
     companions: np.ndarray
     pixel: np.ndarray
+    references: int
 
 
 @ti.kernel
@@ -284,7 +288,8 @@ def sweep_seeds(views, report=None):
         if report is not None:
             report(view + 1)
     points, directions, counts, pixel = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    return SweepSeeds(points, directions, counts, companions_of(points, directions, counts, pixel), pixel)
+    companions = companions_of(points, directions, counts, pixel)
+    return SweepSeeds(points, directions, counts, companions, pixel, int(chosen.sum()))
 
 
 def companions_of(points, directions, counts, pixel):
@@ -310,22 +315,36 @@ def companions_of(points, directions, counts, pixel):
     return companions
 
 
-def swept_gaussians(views, count, opacity, generator, progress):
+def swept_gaussians(views, count, opacity, progress):
     """At most `count` Gaussians where views agree on the direction of an edge, laid along it; None if too few.
 
-    ti.init must have been called. opacity: 0..1.
+    ti.init must have been called. opacity: 0..1. progress: Progress.
     """
     with progress.track("sweep", len(views)) as report:
         seeds = sweep_seeds(views, report)
-    good = np.flatnonzero(seeds.companions >= LEAST_COMPANIONS)
-    order = good[np.argsort(-seeds.companions[good], kind="stable")]
-    pixel = pixel_size(views)
-    cells = np.floor(seeds.points[order] / (THINNED_PX * pixel)).astype(np.int64)
-    chosen = np.sort(order[np.unique(cells, axis=0, return_index=True)[1]])  # the best of each cell
-    if len(chosen) > count:
-        chosen = np.sort(generator.choice(chosen, count, replace=False))
+    chosen = best_seeds(seeds, views, count)
     if len(chosen) < min(LEAST_VOTED, count):
         return None
-    return orient_gaussians(
-        seeds.points[chosen], seeds.directions[chosen], ALONG_PX * pixel, ACROSS_PX * pixel, opacity
-    )
+    along, across = ALONG_PX * pixel_size(views), ACROSS_PX * pixel_size(views)
+    return orient_gaussians(seeds.points[chosen], seeds.directions[chosen], along, across, opacity)
+
+
+def best_seeds(seeds, views, count):
+    """Indices, rising, of the SweepSeeds with most companions, one in each cell of THINNED_PX, at most `count`.
+
+    Nor more than MARGIN times those that the edges have room for: a place on an edge is a reference in each view that
+    has it in sight. Where many views see everything, chance finds companions for most candidates.
+    """
+    order = np.argsort(-seeds.companions, kind="stable")
+    order = order[: np.count_nonzero(seeds.companions >= LEAST_COMPANIONS)]
+    cells = np.floor(seeds.points[order] / (THINNED_PX * pixel_size(views))).astype(np.int64)
+    best = order[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
+    room = seeds.references * EVERY_PX / THINNED_PX / max(views_in_sight(views, seeds.points[best]), 1.0)
+    return np.sort(best[: min(count, int(np.ceil(MARGIN * room)))])
+
+
+def views_in_sight(views, points):
+    """Mean number of views that have a point in their image, over (n, 3) points; 0 where there are none."""
+    some = points[:: -(-len(points) // SIGHTED)] if len(points) else points
+    inside = [inside_image(views.project(some, view)[0], views.width, views.height).sum() for view in range(len(views))]
+    return sum(inside) / max(len(some), 1)
