@@ -1,10 +1,21 @@
 """Samples of edges, who owns an edgel, and what the views say about edges."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from edgel_scenes import CylinderContour, arc, line, pixel_of, views_of
 
-from taichi_edges.edges.evidence import Claims, Samples, claims_of, evidence_of, spaced, support_along, support_of
+from taichi_edges.edges.evidence import (
+    Claims,
+    Samples,
+    claims_of,
+    evidence_of,
+    spaced,
+    support_along,
+    support_of,
+    support_share,
+)
 from taichi_edges.kernels.edgel_matching import EdgelMatching
 from taichi_edges.shapes import EllipticArc, Line, Spline
 
@@ -105,6 +116,24 @@ def test_two_views_confirm_nothing(taichi, generator):
     views = matching_of([A], generator, count=2)
     found = supported(views, [Line(np.array([START, END]))])[0]
     assert found.views == 2 and found.supported_length == 0 and found.confidence < 0.05
+
+
+def test_share_of_the_views_with_an_edge_in_the_image_that_support_it(taichi, generator):
+    views = views_of([A, RIM], generator, noise_px=0.05, count=10)
+    chosen = views.edgels.views < 3  # the others show nothing
+    few = EdgelMatching(replace(views, edgels=views.edgels.keep(chosen)))
+    shapes = [Line(np.array([START, END])), CIRCLE]
+    np.testing.assert_allclose(support_share(few, support_of(few, shapes)), 0.3, atol=0.02)
+    every = EdgelMatching(views)
+    np.testing.assert_allclose(support_share(every, support_of(every, shapes)), 1.0, atol=0.03)
+    # Where three views look another way, those left have it in their image: 3 of 7.
+    away = views.world_to_camera.copy()
+    away[7:, :, :3], away[7:, :, 3] = np.diag([-1, 1, -1]) @ away[7:, :, :3], away[7:, :, 3] * [-1, 1, -1]
+    turned = EdgelMatching(replace(views, edgels=views.edgels.keep(chosen), world_to_camera=away))
+    np.testing.assert_allclose(support_share(turned, support_of(turned, shapes)), 3 / 7, atol=0.03)
+    none = moved(shapes[0], np.array([50.0, 0, 0]))  # in no image
+    assert support_share(few, support_of(few, [none])).tolist() == [0.0]
+    assert len(support_share(few, support_of(few, []))) == 0
 
 
 def test_contour_is_not_sure(taichi, generator):

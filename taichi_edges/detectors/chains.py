@@ -7,16 +7,14 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-LINK_PX = 1.6  # between edgels beside each other on a chain; they are about 1 px apart
+LINK_PX = 1.6  # between edgels next to each other on a chain; they are about 1 px apart
 LINK_COSINE = np.cos(np.radians(25.0))  # between their normals
-SURE_PX = (
-    8.0  # edgels beside each other that say as much as one alone: they share noise, and half of them is there by chance
-)
+SURE_PX = 8.0  # px of a chain that say as much as one edgel alone: those beside each other share their noise
 BESIDE_PX = 0.7  # by which the next edgel may be off the line of the one before
 
 
 def chain_labels(edgels):
-    """(e,) int: the chain of each edgel; chains are numbered over all views."""
+    """(e,) int: the chain of each of the Edgels; chains are numbered over all views."""
     counts, labels = 0, []
     for view in range(edgels.view_count):
         points, normals, _ = edgels.of_view(view)
@@ -27,7 +25,7 @@ def chain_labels(edgels):
 
 
 def _chains_of(points, normals):
-    """Number of chains in one view, and the chain of each edgel."""
+    """Number of chains in one view, and (n,) the chain of each edgel. points: (n, 2) px. normals: (n, 2)."""
     if not len(points):
         return 0, np.zeros(0, np.int64)
     pairs = cKDTree(points).query_pairs(LINK_PX, output_type="ndarray")
@@ -47,14 +45,14 @@ def chain_lengths(edgels):
 
 
 def with_long_chains(edgels, least, height, width):
-    """Edgels on chains of at least `least` px, with the chain's say in how sure they are, and how they run.
+    """The Edgels on chains of at least `least` edgels, with the chain's say in how sure they are, and how they run.
 
-    An edgel is as sure as the edgels of a whole edge together, and its normal is the edge's there.
-    ti.init must have been called.
+    An edgel is as sure as its whole chain, if each SURE_PX of that could be wrong by themselves, and its normal is the
+    chain's there. ti.init must have been called. height, width: pixels.
     """
     from taichi_edges.kernels.smoothing import with_smooth_normals
 
     edgels = with_smooth_normals(edgels, height, width)
     lengths = chain_lengths(edgels)
-    doubt = (1.0 - edgels.strengths) ** (lengths / SURE_PX)
+    doubt = (1.0 - edgels.strengths) ** np.maximum(lengths / SURE_PX, 1.0)  # a short chain says nothing against it
     return replace(edgels, strengths=(1.0 - doubt).astype(np.float32)).keep(lengths >= least)

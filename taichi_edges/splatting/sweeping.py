@@ -18,6 +18,7 @@ from taichi_edges.detectors.chains import chain_lengths
 from taichi_edges.kernels.device import download, upload
 from taichi_edges.kernels.points import F32_1D, F32_2D, I32_1D, I32_2D, U8_3D
 from taichi_edges.splatting.gaussians import orient_gaussians
+from taichi_edges.splatting.seeding import ACROSS_PX, ALONG_PX, LEAST_VOTED
 from taichi_edges.views import pixel_size
 
 EVERY_PX = 8  # one edgel in each cell of this size is a reference
@@ -27,21 +28,20 @@ LEAST_ANGLE, MOST_ANGLE = np.radians(1.5), np.radians(50.0)  # between the rays 
 GRID = 12  # points along each side of the box that tell which views see the same
 STEP_PX = 1.5  # by which a place moves at most, in the neighbour with the longest baseline
 BINS = 12  # of directions in the viewing plane of the reference, 15 degrees each
+ANGLES = 2 * BINS  # that are told apart: what agrees lies in one bin, or in two beside each other
 CODES = 254  # directions of edgels in a byte; 0 stands for no edgel
 NEAREST = 0.02  # unit cube: of a place to the reference's camera
 LEAST_SINE = 0.03  # of the angle between viewing planes; others have no line in common that could be compared
 CANDIDATES = 4  # depths kept for each reference
 TOGETHER = 3  # neighbours that must agree
-NEARBY_PX, ACROSS_PX = 8.0, 1.5  # candidates on the same line, along it and across
+NEARBY_PX, ASIDE_PX = 8.0, 1.5  # candidates on the same line, along it and across
 ALIGNED = np.cos(np.radians(30.0))  # and so much in the same direction: a bin is 15 degrees wide
-LEAST_COMPANIONS = 2
-LEAST_VIEWS, LEAST_SUPPORT = 2.0, 0.1  # of full strength, and their share of those that have a seed in the image
+LEAST_COMPANIONS = 2  # of a seed
 SEARCHED = 20_000  # candidates whose companions are looked for at the same time
 THINNED_PX = 3.0  # one seed in each cell of this size
+BATCH_BYTES = 64 << 20  # distances from edgels that are kept at the same time
 MARGIN = 2.0  # times the seeds that there is room for: some are false
 SIGHTED = 2000  # seeds that tell how many views see a place
-LEAST_VOTED = 50  # fewer seeds than this are no start
-ALONG_PX, BESIDE_PX = 2.0, 0.7  # standard deviations of a Gaussian, in pixels at the scene
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,13 @@ class SweepSeeds:
 
 
 @ti.kernel
-def stamp_directions(starts: I32_1D, elements: F32_2D, nearest: U8_3D, codes: U8_3D):
-    """In every pixel within a pixel of an edgel the code of the nearest one's direction. elements: u, v, code."""
-    for view in range(codes.shape[0]):
+def stamp_directions(first: ti.i32, starts: I32_1D, elements: F32_2D, nearest: U8_3D, codes: U8_3D):
+    """In the 3 x 3 pixels about each edgel the code of its direction; of the nearest one's where there are several.
+
+    elements: (e, 3) u, v, code. nearest: (b, H, W), 255 everywhere, for the views from `first`. codes: (V, H, W).
+    """
+    for own in range(nearest.shape[0]):
+        view = first + own
         for e in range(starts[view], starts[view + 1]):
             column, row = ti.cast(ti.round(elements[e, 0]), ti.i32), ti.cast(ti.round(elements[e, 1]), ti.i32)
             for down in range(-1, 2):
@@ -71,8 +75,8 @@ def stamp_directions(starts: I32_1D, elements: F32_2D, nearest: U8_3D, codes: U8
                     if y >= 0 and x >= 0 and y < codes.shape[1] and x < codes.shape[2]:
                         du, dv = elements[e, 0] - x, elements[e, 1] - y
                         distance = ti.cast(ti.min(255.0, 100.0 * ti.sqrt(du * du + dv * dv)), ti.u8)
-                        if distance < nearest[view, y, x]:
-                            nearest[view, y, x] = distance
+                        if distance < nearest[own, y, x]:
+                            nearest[own, y, x] = distance
                             codes[view, y, x] = ti.cast(elements[e, 2], ti.u8)
 
 
@@ -96,7 +100,7 @@ def sweep_rays(
 
     rays: (n, 3) directions, depth 1. normals: (n, 3) of the viewing planes. ranges: (n, 2) inverse depths. epipoles:
     (m, 3) projections of the reference's centre; cameras (m, 9) the 3x3 parts of theirs. found: (n, CANDIDATES) step
-    times BINS plus bin; counts: neighbours that agree.
+    times ANGLES plus angle; counts: neighbours that agree.
     """
     for i in range(rays.shape[0]):
         ray = ti.Vector([rays[i, 0], rays[i, 1], rays[i, 2]])
@@ -104,7 +108,7 @@ def sweep_rays(
         e1 = ray.normalized()
         e2 = normal.cross(e1)
         steps = ti.cast((ranges[i, 1] - ranges[i, 0]) / step, ti.i32) + 1
-        last, slot = -10, 0
+        first, last, slot = 0, -10, 0
         for k in range(steps):
             inverse = ranges[i, 0] + k * step
             tally, agreeing = ti.u64(0), 0
@@ -137,11 +141,7 @@ def sweep_rays(
                                 )
                                 agreeing += 1
             if agreeing >= needed:
-                best, bin = 0, 0
-                for b in range(BINS):
-                    count = ti.cast(tally >> ti.cast(4 * b, ti.u64) & ti.u64(15), ti.i32)
-                    if count > best:
-                        best, bin = count, b
+                best, middle = most_agreeing(tally)
                 if best >= needed:
                     if k - last > 2:  # another depth: it takes the place of the weakest
                         slot = 0
@@ -149,13 +149,36 @@ def sweep_rays(
                             if counts[i, c] < counts[i, slot]:
                                 slot = c
                         if best > counts[i, slot]:
-                            counts[i, slot], found[i, slot] = best, k * BINS + bin
-                            last = k
-                    elif best > counts[i, slot]:
-                        counts[i, slot], found[i, slot] = best, k * BINS + bin
-                        last = k
+                            counts[i, slot], found[i, slot] = best, k * ANGLES + middle
+                            first, last = k, k
                     else:
                         last = k
+                        if best > counts[i, slot]:
+                            counts[i, slot], found[i, slot] = best, k * ANGLES + middle
+                            first = k
+                        elif best == counts[i, slot]:  # lines are drawn wide: the edge is in the middle
+                            found[i, slot] = (first + k) // 2 * ANGLES + found[i, slot] % ANGLES
+
+
+@ti.func
+def most_agreeing(tally):
+    """The largest count of a tally, and the angle of the directions there, in halves of a bin, 0..ANGLES - 1."""
+    best, bin = 0, 0
+    for b in range(BINS):
+        count = count_in(tally, b)
+        if count > best:
+            best, bin = count, b
+    if bin == 0 and count_in(tally, BINS - 1) == best:
+        bin = BINS - 1
+    # The middle of bins b and b + 1 is where b + 1 begins; where the next two hold as many, all lie in b + 1.
+    both = 1 if count_in(tally, (bin + 1) % BINS) == best else 0
+    return best, (2 * bin + 2 + both) % ANGLES
+
+
+@ti.func
+def count_in(tally, b):
+    """How many of a tally's directions lie in the bins b and b + 1."""
+    return ti.cast(tally >> ti.cast(4 * b, ti.u64) & ti.u64(15), ti.i32)
 
 
 def direction_maps(edgels, height, width):
@@ -164,8 +187,11 @@ def direction_maps(edgels, height, width):
     code = np.minimum(np.floor(angles / np.pi * CODES), CODES - 1) + 1
     elements = np.column_stack([edgels.points, code]).astype(np.float32)
     codes = upload(np.zeros((edgels.view_count, height, width), np.uint8))
-    nearest = upload(np.full((edgels.view_count, height, width), 255, np.uint8))
-    stamp_directions(upload(edgels.starts.astype(np.int32)), upload(elements), nearest, codes)
+    starts, elements = upload(edgels.starts.astype(np.int32)), upload(elements)
+    batch = max(BATCH_BYTES // (height * width), 1)
+    for first in range(0, edgels.view_count, batch):
+        size = min(batch, edgels.view_count - first)
+        stamp_directions(first, starts, elements, upload(np.full((size, height, width), 255, np.uint8)), codes)
     middles = (np.arange(-1, CODES) + 0.5) / CODES * np.pi
     return codes, upload(np.cos(middles).astype(np.float32)), upload(np.sin(middles).astype(np.float32))
 
@@ -181,8 +207,8 @@ def neighbor_views(views):
     towards /= np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), 1e-12)
     chosen = []
     for view in range(len(views)):
-        angles = np.arccos(np.clip((towards * towards[view]).sum(axis=2), -1, 1))
-        good = seen & seen[view] & (angles > LEAST_ANGLE) & (angles < MOST_ANGLE)
+        cosines = (towards * towards[view]).sum(axis=2)
+        good = seen & seen[view] & (cosines < np.cos(LEAST_ANGLE)) & (cosines > np.cos(MOST_ANGLE))
         counts = good.sum(axis=1)
         order = np.argsort(-counts, kind="stable")
         chosen.append(order[counts[order] > 0][:MOST_NEIGHBORS])
@@ -223,8 +249,8 @@ def sweep_view(views, view, chosen, others, maps):
     sweep_rays(*f32, step, *pair, upload(others.astype(np.int32)), codes, cosines, sines, TOGETHER, found, counts)
     found, counts = download(found), download(counts)
     which, slot = np.nonzero(counts >= TOGETHER)
-    inverse = 1 / far[which] + (found[which, slot] // BINS) * step
-    angle = (found[which, slot] % BINS + 1) * np.pi / BINS
+    inverse = 1 / far[which] + (found[which, slot] // ANGLES) * step
+    angle = (found[which, slot] % ANGLES) * np.pi / ANGLES
     e1 = rays[which] / np.linalg.norm(rays[which], axis=1, keepdims=True)
     e2 = np.cross(planes[which], e1)
     directions = np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2
@@ -233,7 +259,7 @@ def sweep_view(views, view, chosen, others, maps):
 
 def through_box(origin, rays, box):
     """Where rays enter and leave the box, in multiples of the rays; not in order where they miss it."""
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # along a side: infinite; in a side: NaN, which is not inside
         sides = (box[:, None] - origin) / rays
     return np.minimum(*sides).max(axis=1), np.maximum(*sides).min(axis=1)
 
@@ -284,7 +310,7 @@ def companions_of(points, directions, counts, pixel):
             apart, direction = points[other] - points[one], directions[one]
             across = np.linalg.norm(apart - (apart * direction).sum(axis=1)[:, None] * direction, axis=1)
             aligned = np.abs((direction * directions[other]).sum(axis=1)) >= ALIGNED
-            same = (one != other) & aligned & (across <= ACROSS_PX * pixel[one])
+            same = (one != other) & aligned & (across <= ASIDE_PX * pixel[one])
             np.add.at(companions, one[same], counts[other[same]] - 2)
     return companions
 
@@ -299,7 +325,7 @@ def swept_gaussians(views, count, opacity, progress):
     chosen = best_seeds(seeds, views, count)
     if len(chosen) < min(LEAST_VOTED, count):
         return None
-    along, across = ALONG_PX * pixel_size(views), BESIDE_PX * pixel_size(views)
+    along, across = ALONG_PX * pixel_size(views), ACROSS_PX * pixel_size(views)
     return orient_gaussians(seeds.points[chosen], seeds.directions[chosen], along, across, opacity)
 
 
