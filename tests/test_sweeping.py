@@ -215,6 +215,15 @@ def test_neighbours_see_the_same_from_elsewhere():
         assert len(set(others)) == sweeping.MOST_NEIGHBORS or set(near) <= set(others)
 
 
+def test_of_neighbours_that_see_as_much_those_apart_are_chosen(monkeypatch):
+    centres = np.column_stack([np.arange(9.0), np.zeros((9, 2))])  # a row of cameras
+    monkeypatch.setattr(sweeping, "MOST_NEIGHBORS", 3)
+    assert sweeping.best_and_apart(np.array([5, 5, 5, 5, 0, 5, 5, 5, 5]), centres, 4).tolist() == [0, 8, 2]
+    assert sweeping.best_and_apart(np.array([5, 5, 9, 5, 0, 8, 5, 5, 5]), centres, 4).tolist() == [2, 5, 8]
+    assert sweeping.best_and_apart(np.array([0, 0, 0, 7, 0, 0, 0, 0, 0]), centres, 4).tolist() == [3]
+    assert sweeping.best_and_apart(np.zeros(9, int), centres, 4).tolist() == []
+
+
 def test_pixels_beside_edgels_know_the_nearest_ones_direction(taichi, generator):
     points, angles = generator.uniform(-2, 42, (40, 2)), generator.uniform(0, 2 * np.pi, 40)
     normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)

@@ -209,10 +209,23 @@ def neighbor_views(views):
     for view in range(len(views)):
         cosines = (towards * towards[view]).sum(axis=2)
         good = seen & seen[view] & (cosines < np.cos(LEAST_ANGLE)) & (cosines > np.cos(MOST_ANGLE))
-        counts = good.sum(axis=1)
-        order = np.argsort(-counts, kind="stable")
-        chosen.append(order[counts[order] > 0][:MOST_NEIGHBORS])
+        chosen.append(best_and_apart(good.sum(axis=1), centres, view))
     return chosen
+
+
+def best_and_apart(counts, centres, view):
+    """Indices of at most MOST_NEIGHBORS views with the largest counts that are not 0, the best first.
+
+    Of equal ones that which is farthest from those before it, and from the view: where all see the whole scene, they
+    shall not be six beside each other. counts: (V,). centres: (V, 3) of the cameras.
+    """
+    found, apart = [], np.linalg.norm(centres - centres[view], axis=1)
+    counts = counts.copy()
+    while len(found) < MOST_NEIGHBORS and counts.any():
+        found.append(int(np.argmax(np.where(counts == counts.max(), apart, -1.0))))
+        apart = np.minimum(apart, np.linalg.norm(centres - centres[found[-1]], axis=1))
+        counts[found[-1]] = 0
+    return np.array(found, np.int64)
 
 
 def camera_centres(views):
