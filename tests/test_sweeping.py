@@ -163,6 +163,11 @@ def test_views_that_see_nothing_in_common_give_nothing(taichi, generator):
     assert len(sweep_seeds(views).points) == 0
 
 
+def test_rays_that_miss_the_box_give_nothing(taichi, generator):
+    corner = replace(views_of(CURVES, generator), box=np.array([[0.0, 0, 0], [0.05, 0.05, 0.05]]))
+    assert len(sweep_seeds(corner).points) == 0
+
+
 def test_no_edgels_and_no_long_chains_give_nothing(taichi, generator):
     assert len(sweep_seeds(without_edgels(8)).points) == 0
     short = cluttered(without_edgels(8), generator, strokes=50, length=sweeping.LEAST_CHAIN // 2)
