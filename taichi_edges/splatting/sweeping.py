@@ -184,7 +184,7 @@ def count_in(tally, b):
 
 
 def direction_maps(edgels, height, width):
-    """(V, H, W) uint8 codes of the directions of Edgels, see `stamp_directions`; cosines and sines (CODES + 1,) of each.
+    """(V, H, W) uint8 codes of directions of Edgels, see `stamp_directions`; cosines and sines (CODES + 1,) of codes.
 
     All on the device. height, width: pixels.
     """
