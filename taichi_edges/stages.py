@@ -21,7 +21,7 @@ from taichi_edges.cameras import transform
 from taichi_edges.edge_set import read_edges, write_edges
 from taichi_edges.errors import UserError, did_you_mean
 from taichi_edges.findings import amount
-from taichi_edges.views import read_views, write_views
+from taichi_edges.views import pixel_size, read_views, write_views
 from taichi_edges.wireframe import read_wireframe, write_wireframe
 
 WIDEST_PX = 40.0  # of a detector's lines
@@ -458,7 +458,7 @@ def cluster(run):
             seen = f"an edge must be seen in {run.config.filter.min_views:g} views at full strength"
             cure = f"{len(views)} views are too few, {seen}: take more, or set filter.refine: false"
         raise UserError(f"{run.path('gaussians.ply')}: {problem}; {cure}")
-    found = assemble(points, directions, run.config.cluster)
+    found = assemble(points, directions, run.config.cluster, pixel_size(views))
     found, contours = without_contours(found, points, directions, explained, views, run.config.filter)
     labels = found.labels
     write_oriented_points(run.path("points.ply"), views.similarity.to_input(points), directions, labels)

@@ -19,11 +19,12 @@ from taichi_edges.edges.clustering import (
 from taichi_edges.edges.fitting import NOISE_FLOOR, Fit, fit_cluster, fit_line, wireframe_of
 from taichi_edges.edges.free_curves import free_curves
 from taichi_edges.edges.merging import merged
-from taichi_edges.edges.noise import measured_scale
+from taichi_edges.edges.noise import MOST_NOISE, measured_scale
 from taichi_edges.edges.segmentation import split_clusters
 from taichi_edges.shapes import Line
 
 HALO = 0.5  # of a point's neighbours: where so many lie on an edge, the point is a stray one of it
+MOST_NOISE_PX = 3.0  # an edgel so far off would not have been the edge's
 ARC_NUMBERS = 12  # origin, tangent, bend; low, high, closed
 
 
@@ -47,10 +48,11 @@ class Assembly:
         return Assembly(numbers[self.labels], shared, self.arcs[chosen])
 
 
-def assemble(points, directions, config):
+def assemble(points, directions, config, pixel=np.inf):
     """The Assembly of oriented points.
 
     points: (n, 3) unit cube. directions: (n, 3) unit vectors, sign arbitrary. config: the scene's `cluster` section.
+    pixel: size of a pixel at the scene, unit-cube units.
     """
     if len(points) < 2:
         return Assembly(np.full(len(points), UNASSIGNED), np.zeros((0, 2), int), np.zeros((0, ARC_NUMBERS)))
@@ -59,7 +61,8 @@ def assemble(points, directions, config):
     seeds = seed_order(points, directions, graph, aligned)
     follows = (graph.indices >= 0) & (aligned >= config.theta)
     neighbors = [row[good] for row, good in zip(graph.indices, follows, strict=True)]
-    cloud = Cloud(points, directions, measured_scale(points, directions, neighbors, seeds, config.max_gap))
+    most = min(MOST_NOISE, MOST_NOISE_PX * pixel)
+    cloud = Cloud(points, directions, measured_scale(points, directions, neighbors, seeds, config.max_gap, most))
     found, ledger = claims(cloud, neighbors, seeds, config.min_points)
     pieces = merged(cloud, found, ledger.noise)
     free, replaced = free_curves(cloud, pieces, config)

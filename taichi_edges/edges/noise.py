@@ -19,17 +19,18 @@ RAYLEIGH = 1.1774  # median distance over the standard deviation on each axis, o
 LEAST_TURN, FIRST_TURN = np.radians([0.5, 5.0])  # of directions: at least, and until they have been measured
 
 
-def measured_scale(points, directions, neighbors, seeds, gap):
+def measured_scale(points, directions, neighbors, seeds, gap, most=MOST_NOISE):
     """The Scale of oriented points.
 
     points, directions: (n, 3). neighbors: for every point its aligned neighbours. seeds: (n,) indices, best first.
-    gap: points of an edge are no farther apart, unit-cube units.
+    gap: points of an edge are no farther apart, unit-cube units. most: noise, unit-cube units: among curved edges close
+    to each other, tolerances that are raised take in ever more of the neighbours.
     """
     better = np.asarray(seeds)[: max(len(seeds) // 2, 1)]  # stray points and the midst of junctions come last
     probes = better[np.linspace(0, len(better) - 1, min(PROBES, len(better))).astype(int)]
     noise, turn = LEAST_NOISE, FIRST_TURN
     cloud = Cloud(points, directions, Scale(noise, turn, gap))
-    while noise < MOST_NOISE:
+    while noise < most:
         cloud = cloud.at_scale(Scale(noise, turn, gap))
         grown = grown_from_seeds(cloud, neighbors, probes)
         found = [residual for pair in grown for residual in _residuals(cloud, pair)]
@@ -40,7 +41,7 @@ def measured_scale(points, directions, neighbors, seeds, gap):
             if measured <= CUT_OFF * noise:
                 break
         noise *= STEP
-    return Scale(noise, turn, gap)
+    return Scale(min(noise, most), turn, gap)
 
 
 def _residuals(cloud, pair):
