@@ -327,7 +327,9 @@ def part_project(tmp_path_factory):
 def test_edges_come_out_in_the_frame_and_scale_of_colmap(part_project, tmp_path):
     folder, part, into_colmap = part_project
     told = Told()
-    (tmp_path / "part.yaml").write_text(f"scale: part\nsource: {{reader: colmap, path: {folder}}}\ntrain: {{steps: 120}}\n")
+    (tmp_path / "part.yaml").write_text(
+        f"scale: part\nsource: {{reader: colmap, path: {folder}}}\ntrain: {{steps: 120}}\n"
+    )
     run = Run(load_scene(tmp_path / "part.yaml"), tmp_path / "run", threads=2, progress=told)
     record = run_stages(run, until="refine")
     facts = record["stages"]["prepare"]["facts"]
@@ -361,10 +363,8 @@ def test_maps_for_a_scan_go_the_way_of_the_images_that_prepare_has_kept(project,
     cv2.imwrite(str(folder / "images" / "0005.jpg"), np.zeros((300, 400), np.uint8))
     (folder / "maps").mkdir()
     for view in range(VIEWS):
-        half = cv2.rectangle(np.zeros((120, 160), np.uint8), (40, 30), (110, 80), 255, 2)
-        cv2.imwrite(
-            str(folder / "maps" / f"{view:04d}.png"), half if view < VIEWS - 1 else cv2.resize(half, (400, 300))
-        )
+        drawn = cv2.rectangle(np.zeros((120, 160), np.uint8), (40, 30), (110, 80), 255, 2)  # half as large
+        cv2.imwrite(str(folder / "maps" / f"{view:04d}.png"), drawn)
     evaluation = {"kind": "scan", "truth": "scan.ply", "scan": {"edges": "maps"}}
     run = Run(scene(folder, evaluation=evaluation), tmp_path / "run", threads=2, progress=Told())
     size = undistorted(Lens("OPENCV", *SIZE, LENSES["OPENCV"]))[1]
