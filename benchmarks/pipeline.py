@@ -64,7 +64,7 @@ class Measured:
 def missing_data(scene, data_root):
     """Why a scene cannot run here, or None."""
     try:
-        run = Run(load_scene(str(scene), None, [], None), Path("nowhere"), data_root)
+        run = Run(load_scene(str(scene), data_root=data_root), Path("nowhere"), data_root)
         run = with_reader(run) if run.config.source.reader == "auto" else run
         for stage in STAGES.values():
             stage.outside(run)

@@ -15,13 +15,14 @@ MOST_THREADS = 256  # each has a plane of its own to draw into
 
 def run_command(options):
     """Run what the parsed command line `options` asks for; mistakes of the user raise UserError."""
-    config = load_scene(options.scene, options.preset, options.set, options.seed, options.scale)
+    data_root = _data_root(options.data)
+    config = load_scene(options.scene, options.preset, options.set, options.seed, options.scale, data_root)
     if options.show:
         _refuse_vain_show(options.until)
     run = Run(
         config=config,
         folder=Path(options.out) / config.name,
-        data_root=_data_root(options.data),
+        data_root=data_root,
         threads=_threads(options.threads),
         arch=options.arch,
         progress=make_progress(options.quiet),

@@ -6,9 +6,10 @@ COLMAP puts the centre of the top-left pixel at (0.5, 0.5); what leaves this mod
 import functools
 import shutil
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
+import numpy as np  # before pycolmap, always: the other way round the process dies later, 'free(): invalid pointer'
 
 from taichi_edges.artefacts import file_state
 from taichi_edges.errors import UserError, did_you_mean
@@ -31,6 +32,11 @@ def _colmap():
 
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     return pycolmap
+
+
+def colmap_version():
+    """Of pycolmap: what COLMAP has computed belongs to it."""
+    return version("pycolmap")
 
 
 @dataclass(frozen=True)
@@ -275,6 +281,9 @@ def _map(database, images, folder, count, seed, progress):
 
 
 def known_focal_length(path):
-    """Focal length in pixels that an image's EXIF tells, None where it tells none."""
-    camera = _colmap().infer_camera_from_image(str(path))
+    """Focal length in pixels that an image's EXIF tells, None where it tells none. UserError: not an image."""
+    try:
+        camera = _colmap().infer_camera_from_image(str(path))
+    except (ValueError, RuntimeError) as error:
+        raise UserError(f"{path}: not an image that COLMAP can read; write it again, or leave it out") from error
     return camera.mean_focal_length() if camera.has_prior_focal_length else None

@@ -59,6 +59,7 @@ STAGES = {
         (),
         ("views.npz", "held_out.npz"),
         stages.source_files,
+        packages=("pycolmap",),
     ),
     "train": Stage(
         stages.train,

@@ -76,22 +76,25 @@ def overlay(base, over):
     return merged
 
 
-def load_scene(path, preset=None, settings=(), seed=None, scale=None):
+def load_scene(path, preset=None, settings=(), seed=None, scale=None, data_root=None):
     """Read and check a scene: a YAML file, or a folder of photographs or of a layout that the readers know.
 
     preset, scale: override the scene's, and the scene's own values where they name them.
     settings: 'key.subkey=value' strings, YAML values. seed: overrides the scene's.
+    data_root: folder in which a relative source.path starts, None without; a scene that names no scale gets that of
+    the layout found there.
     """
     path = Path(path)
     content = _folder_content(path) if is_source(path) else _file_content(path)
     _refuse_unknown("preset", preset, PRESETS)
     _refuse_unknown("scale", scale, SCALES)
-    content = {**_scale_of_reader(content), **content}
+    parsed = [(*_parse_setting(setting), setting) for setting in settings]
+    if scale is None and "scale" not in content:
+        content |= _scale_of_source({**_section(content), **_settings_of_source(parsed)}, data_root)
     content = overlay(_starting_values(content.get("preset"), scale or content.get("scale")), content)
     content = _overridden(content, preset, scale)
     origins = {}
-    for setting in settings:
-        keys, value = _parse_setting(setting)
+    for keys, value, setting in parsed:
         origins[keys] = f"--set {setting}"
         for name in reversed(keys):
             value = {name: value}
@@ -102,12 +105,39 @@ def load_scene(path, preset=None, settings=(), seed=None, scale=None):
     return check_scene(content, path, origins)
 
 
-def _scale_of_reader(content):
-    """{'scale': ...} for a scene of photographs, as its reader tells; {} for others."""
+def _section(content):
+    """The section `source` as the scene has it; {} where there is none."""
     source = content.get("source")
-    reader = source.get("reader") if isinstance(source, dict) else None
+    return source if isinstance(source, dict) else {}
+
+
+def _settings_of_source(parsed):
+    """The keys of the section `source` that the command line sets. parsed: (keys, value, text) of every `--set`."""
+    return {keys[1]: value for keys, value, _ in parsed if len(keys) == 2 and keys[0] == "source"}
+
+
+def _scale_of_source(source, data_root):
+    """{'scale': ...} for a scene of photographs, as its reader tells, named or recognised; {} for others."""
+    reader = source.get("reader", "auto")
+    if reader == "auto":
+        reader = _recognised_reader(source.get("path"), data_root)
     scale = SCALES_OF_READERS.get(reader) if isinstance(reader, str) else None
     return {} if scale is None else {"scale": scale}
+
+
+def _recognised_reader(text, data_root):
+    """The reader that fits what is at a source.path; None where that is unknown: the stage that reads it says why."""
+    from taichi_edges.readers.recognition import recognise
+
+    if not isinstance(text, str) or not text:
+        return None
+    try:
+        path = Path(text).expanduser()
+        if not path.is_absolute() and data_root is None:
+            return None
+        return recognise(path if path.is_absolute() else Path(data_root) / path).reader
+    except (UserError, OSError, RuntimeError, ValueError):
+        return None
 
 
 def is_source(path):
@@ -117,14 +147,9 @@ def is_source(path):
 
 def _folder_content(path):
     """The scene that a folder without a scene file is: its own path and name, everything else as by default."""
-    from taichi_edges.readers.recognition import recognise, scene_name
+    from taichi_edges.readers.recognition import scene_name
 
-    try:
-        reader = recognise(path).reader
-    except UserError:  # the stage that reads it says so, with what it needs
-        reader = "auto"
-    scale = SCALES_OF_READERS.get(reader, "part")
-    return {"name": scene_name(path), "scale": scale, "source": {"reader": "auto", "path": str(path.resolve())}}
+    return {"name": scene_name(path), "source": {"reader": "auto", "path": str(path.resolve())}}
 
 
 def _file_content(path):

@@ -66,9 +66,9 @@ def _listed_frames(run, **changed):
     return READERS[source.reader](run.data_path(source.path, "source.path"), source)
 
 
-def _posed_frames(run, frames):
-    """The frames themselves; photographs without poses after structure from motion."""
-    source = run.config.source
+def _posed_frames(run, frames, **changed):
+    """The frames themselves; photographs without poses after structure from motion. changed: see `_listed_frames`."""
+    source = run.config.source.model_copy(update=changed)
     if source.reader != "images":
         return frames
     from taichi_edges.readers.photos import posed_photos
@@ -576,12 +576,15 @@ def _scan_maps(run, views, held_out):
         return dict(zip(names, [*views.edge_maps, *held_out.edge_maps], strict=True))
     if source.reader == "synthetic":
         raise UserError("evaluation.scan.edges: a synthetic scene has no folders of maps; leave it out")
-    from taichi_edges.readers.frames import chosen_frames
+    from taichi_edges.readers.frames import chosen_frames, subset
     from taichi_edges.readers.images import read_edge_maps
     from taichi_edges.readers.undistortion import undistorted_frames
 
     frames, made = chosen_frames(_listed_frames(run, edges=folder), source.skip), run.path("undistorted_for_scan")
-    frames = undistorted_frames(frames, made, source.max_size, source.gamma, run.threads, run.progress)
+    frames = _posed_frames(run, frames, edges=folder)
+    frames = subset(frames, [frames.names.index(name) for name in names])  # prepare may have left some views out
+    options = {"threads": run.threads, "progress": run.progress, "kinds": ("edge_paths",)}
+    frames = undistorted_frames(frames, made, source.max_size, source.gamma, **options)
     maps = dict(zip(frames.names, read_edge_maps(frames, run.progress, run.threads), strict=True))
     if next(iter(maps.values())).shape != views.edge_maps.shape[1:]:
         problem = f"its maps are not {views.width} x {views.height} px as the scene's views are"

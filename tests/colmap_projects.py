@@ -1,7 +1,7 @@
 """COLMAP projects whose truth is known: models written by pycolmap, pictures drawn through its lenses."""
 
 import cv2
-import numpy as np
+import numpy as np  # before pycolmap: see photogrammetry
 import pycolmap
 
 from taichi_edges.cameras import invert_pose

@@ -1,6 +1,7 @@
 """COLMAP projects: which model, which images, masks, points and box; and that edges come out in COLMAP's frame."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from taichi_edges import stages
 from taichi_edges.cameras import invert_pose
 from taichi_edges.edge_set import read_edges
 from taichi_edges.errors import UserError
+from taichi_edges.photogrammetry import Lens, undistorted
 from taichi_edges.pipeline import Run, run_stages
 from taichi_edges.progress import Progress
 from taichi_edges.readers.colmap import read_colmap
@@ -325,7 +327,9 @@ def part_project(tmp_path_factory):
 def test_edges_come_out_in_the_frame_and_scale_of_colmap(part_project, tmp_path):
     folder, part, into_colmap = part_project
     told = Told()
-    (tmp_path / "part.yaml").write_text(f"scale: part\nsource: {{reader: colmap, path: {folder}}}\ntrain: {{steps: 120}}\n")
+    (tmp_path / "part.yaml").write_text(
+        f"scale: part\nsource: {{reader: colmap, path: {folder}}}\ntrain: {{steps: 120}}\n"
+    )
     run = Run(load_scene(tmp_path / "part.yaml"), tmp_path / "run", threads=2, progress=told)
     record = run_stages(run, until="refine")
     facts = record["stages"]["prepare"]["facts"]
@@ -350,3 +354,22 @@ def test_edges_come_out_in_the_frame_and_scale_of_colmap(part_project, tmp_path)
     assert np.allclose(np.sort(started[: len(seeds)], axis=0), np.sort(seeds, axis=0), atol=1e-5)
     again = run_stages(Run(run.config, run.folder, threads=2), until="refine")
     assert again["ran"] == []
+
+
+def test_maps_for_a_scan_go_the_way_of_the_images_that_prepare_has_kept(project, tmp_path):
+    """One camera of two sees what prepare leaves out: its larger pictures make no larger canvas."""
+    small, large = camera(), camera("OPENCV", 2, (400, 300), (375, 388, 200.5, 149, -0.1, 0.02, 0.003, -0.002))
+    folder = project(cameras=[small] * (VIEWS - 1) + [large])
+    cv2.imwrite(str(folder / "images" / "0005.jpg"), np.zeros((300, 400), np.uint8))
+    (folder / "maps").mkdir()
+    for view in range(VIEWS):
+        drawn = cv2.rectangle(np.zeros((120, 160), np.uint8), (40, 30), (110, 80), 255, 2)  # half as large
+        cv2.imwrite(str(folder / "maps" / f"{view:04d}.png"), drawn)
+    evaluation = {"kind": "scan", "truth": "scan.ply", "scan": {"edges": "maps"}}
+    run = Run(scene(folder, evaluation=evaluation), tmp_path / "run", threads=2, progress=Told())
+    size = undistorted(Lens("OPENCV", *SIZE, LENSES["OPENCV"]))[1]
+    names = [f"{view:04d}" for view in range(VIEWS - 1)]
+    views = SimpleNamespace(names=names[1:], edge_maps=np.zeros((1, *size[::-1]), np.uint8))
+    maps = stages._scan_maps(run, views, SimpleNamespace(names=names[:1]))
+    assert set(maps) == set(names) and all(each.shape == size[::-1] and each.max() > 200 for each in maps.values())
+    assert not (run.path("undistorted_for_scan") / "images").exists()

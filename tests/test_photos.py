@@ -4,6 +4,7 @@ import json
 import shutil
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -126,6 +127,9 @@ def test_the_same_photographs_are_not_solved_again(album, solved, monkeypatch):
     with pytest.raises(TypeError):
         told, config = Told(), config_of(album[0])
         posed_photos(read_photos(album[0], config), album[0], config, solved[2], 1, 2, told)  # another seed
+    monkeypatch.setattr(photos, "colmap_version", lambda: "another")
+    with pytest.raises(TypeError):
+        posed(album[0], solved[2])
 
 
 def test_threads_and_repetition_do_not_change_a_bit(album, solved, tmp_path):
@@ -236,3 +240,55 @@ def test_a_damaged_record_is_no_obstacle(album, solved, tmp_path, monkeypatch):
 
 def test_the_module_is_imported_without_pycolmap():
     assert "pycolmap" not in vars(photogrammetry)
+
+
+def test_files_that_are_no_images_are_left_out_by_name(album, tmp_path, monkeypatch):
+    for name in album[1]:
+        shutil.copy(album[0] / f"{name}.png", tmp_path)
+    (tmp_path / "notes.tif").write_text("no picture")
+    (tmp_path / "text.jpg").write_bytes(b"no picture\xff\xd9")
+    given = []
+    monkeypatch.setattr(photos, "reconstruct", lambda images, names, groups, *rest: given.extend(names) or [])
+    for _ in range(2):  # the second time as it is recorded
+        told, config = Told(), config_of(tmp_path)
+        with pytest.raises(UserError, match="only 0 of 6"):
+            posed_photos(read_photos(tmp_path, config), tmp_path, config, tmp_path / "cache", 0, 2, told)
+        assert told.warnings == ["2 of 8 photographs are no images that can be read, left out: notes.tif, text.jpg"]
+    assert given == sorted(f"{name}.png" for name in album[1])
+
+
+@pytest.mark.parametrize("damage", ["cut", "lost", "another"])
+def test_a_damaged_model_of_an_earlier_run_is_made_anew(album, solved, tmp_path, monkeypatch, damage):
+    shutil.copytree(solved[2], tmp_path / "cache")
+    path, whole = tmp_path / "cache" / "sparse" / "images.bin", solved[2] / "sparse" / "images.bin"
+    if damage == "lost":
+        path.unlink()
+    else:
+        path.write_bytes(whole.read_bytes()[:-100] if damage == "cut" else whole.read_bytes()[:-1] + b"\1")
+
+    def remade(images, names, groups, cache, *rest):
+        shutil.copy(whole, path)
+        return json.loads((cache / "photographs.json").read_text())["registered"]
+
+    monkeypatch.setattr(photos, "reconstruct", remade)
+    frames, told = posed(album[0], tmp_path / "cache")
+    assert frames.names == solved[0].names and any("structure from motion from 7" in text for text in told.notes)
+
+
+def test_maps_for_a_scan_are_found_where_photographs_have_no_poses(album, solved, tmp_path):
+    """They go the way of the photographs: undistorted with the lenses that structure from motion has found."""
+    for folder in ("photos", "maps"):
+        shutil.copytree(album[0], tmp_path / folder)
+    shutil.copytree(solved[2], tmp_path / "run" / "sfm")
+    source = {"reader": "images", "path": str(tmp_path), "images": "photos"}
+    evaluation = {"kind": "scan", "truth": "scan.ply", "scan": {"edges": "maps"}}
+    scene = {"name": "album", "source": source, "evaluation": evaluation}
+    run = Run(check_scene(scene, Path("album.yaml")), tmp_path / "run", threads=2, progress=Told())
+    frames = stages._posed_frames(run, stages._listed_frames(run))
+    names = frames.names[1:]  # prepare has left one out
+    size = photogrammetry.undistorted(frames.lenses[0])[1]
+    views = SimpleNamespace(names=names[:-1], edge_maps=np.zeros((1, *size[::-1]), np.uint8))
+    maps = stages._scan_maps(run, views, SimpleNamespace(names=names[-1:]))
+    assert list(maps) == names and all(found.shape == size[::-1] and found.max() > 100 for found in maps.values())
+    made = run.path("undistorted_for_scan")
+    assert len(list(made.glob("edges/*.png"))) == len(names) and not (made / "images").exists()

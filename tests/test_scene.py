@@ -425,3 +425,35 @@ def test_an_unknown_scale_is_refused(scene):
     assert "scale: must be" in refusal(scene("scale: [room]"))
     assert refusal(scene(), scale="city").startswith("--scale city: there is no such scale; there is part, object")
     assert "use --scale room" in refusal(scene(), settings=["scale=room"])
+
+
+@pytest.fixture
+def photographs(tmp_path):
+    """A data root with photographs in `album`, and an IDR scene in `thing`."""
+    for name in ("album/a.png", "album/b.png", "thing/image/0.png", "thing/cameras_sphere.npz"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    return tmp_path
+
+
+@pytest.mark.parametrize("reader", ["", "reader: auto, "])
+def test_a_scene_without_a_reader_has_the_scale_of_the_one_that_fits(scene, photographs, reader):
+    path = scene(f"preset: paper\nsource: {{{reader}path: album}}\n", base="")
+    config = load_scene(path, data_root=photographs)
+    assert (config.scale, config.source.reader) == ("building", "auto")
+    assert config.train.orient_weight == SCALES["building"]["paper"]["train"]["orient_weight"]
+    assert load_scene(path, data_root=photographs, settings=["source.path=thing"]).scale == "object"
+    assert load_scene(path, data_root=photographs, scale="room").scale == "room"
+    assert load_scene(path).scale == load_scene(path, data_root=photographs / "album").scale == "part"  # not there
+    absolute = scene(f"source: {{{reader}path: {photographs / 'thing'}}}\n", base="")
+    assert load_scene(absolute).scale == "object"
+    said = scene(f"scale: part\nsource: {{{reader}path: album}}\n", base="")
+    assert load_scene(said, data_root=photographs).scale == "part"
+
+
+def test_a_reader_on_the_command_line_brings_its_scale(scene, photographs):
+    assert load_scene(photographs / "album").scale == "building"
+    assert load_scene(photographs / "album", settings=["source.reader=emap"]).scale == "part"
+    assert load_scene(photographs / "thing", settings=["source.reader=colmap"]).scale == "building"
+    named = scene("source: {path: thing}", base="")
+    assert load_scene(named, settings=["source.reader=nerfstudio"]).scale == "building"

@@ -11,6 +11,7 @@ from taichi_edges.detectors.subpixel import detect_edgels
 from taichi_edges.errors import UserError
 from taichi_edges.photogrammetry import Lens, undistorted
 from taichi_edges.progress import Progress
+from taichi_edges.readers import undistortion
 from taichi_edges.readers.frames import Frames
 from taichi_edges.readers.picture_sizes import picture_size
 from taichi_edges.readers.undistortion import undistorted_frames, undistortion_map
@@ -266,3 +267,30 @@ def test_what_no_pinhole_camera_can_show_is_refused_in_one_line():
         undistorted(Lens("OPENVC", 640, 320, (1.0,)))
     with pytest.raises(UserError, match="fx, fy, cx, cy"):
         undistorted(Lens("PINHOLE", 640, 320, (1.0, 2.0)))
+
+
+@pytest.mark.parametrize("kind", ["images", "valid"])
+def test_a_damaged_or_replaced_picture_is_made_again(make, kind):
+    lens = Lens("SIMPLE_RADIAL", 320, 240, (190.0, 160.0, 120.0, -0.35))  # shows nothing in the corners
+    drawn = picture_of_polygon(camera("OPENCV"), POLYGON)
+    frames, _ = make({"a": drawn}, [lens])
+    path = Path((frames.image_paths if kind == "images" else frames.valid_paths)[0])
+    good = path.read_bytes()
+    for bad in (good[: len(good) // 2], cv2.imencode(".png", np.zeros((9, 9), np.uint8))[1].tobytes()):
+        path.write_bytes(bad)
+        make({"a": drawn}, [lens])
+        assert path.read_bytes() == good
+
+
+def test_another_version_of_colmap_may_know_lenses_better(make, monkeypatch):
+    drawn = picture_of_polygon(camera("OPENCV"), POLYGON)
+    make({"a": drawn}, [lens_of("OPENCV")])
+    monkeypatch.setattr(undistortion, "colmap_version", lambda: "another")
+    assert make({"a": drawn}, [lens_of("OPENCV")])[1].steps["undistort"] == 1
+
+
+def test_views_whose_names_make_one_file_name_get_one_each(make):
+    drawn = picture_of_polygon(camera("OPENCV"), POLYGON)
+    images = {"b": drawn, "./b": 255 - drawn, "b-2": drawn // 2}
+    frames, _ = make(images, [lens_of("OPENCV")] * 3)
+    assert [Path(path).stem for path in frames.image_paths] == ["b", "b-3", "b-2"]

@@ -9,7 +9,7 @@ import numpy as np
 
 from taichi_edges.artefacts import digest, digest_file, write_json
 from taichi_edges.errors import UserError, name_some
-from taichi_edges.photogrammetry import known_focal_length, model_files, reconstruct
+from taichi_edges.photogrammetry import colmap_version, known_focal_length, model_files, reconstruct
 from taichi_edges.readers.colmap import frames_of_model
 from taichi_edges.readers.companions import edge_paths, is_picture, mask_folder, mask_paths
 from taichi_edges.readers.frames import Frames, is_usable
@@ -67,24 +67,48 @@ def posed_photos(frames, folder, config, cache, seed, threads, progress):
     folder: of edge maps and masks. config: the scene's `source` section.
     """
     images, names = frames.where, _whole(frames, progress)
-    if len(names) < FEWEST:
-        raise UserError(f"{images}: {len(names)} photographs are too few to find where they were taken; {ADVICE}")
+    _refuse_few(images, names)
     masks = {name: path for name, path in zip(_names(frames), frames.mask_paths, strict=True) if path}
     seen = [(name, *map(digest_file, [images / name, *([masks[name]] if name in masks else [])])) for name in names]
-    key = digest([METHOD, seed, seen])
+    key = digest([METHOD, colmap_version(), seed, seen])
     record = cache / "photographs.json"
-    registered = _known(record, key, cache)
-    if registered is None:
+    known = _known(record, key, cache)
+    if known is None:
         progress.say(f"structure from motion from {len(names)} photographs, once")
-        groups = _by_camera(images, names, threads)
-        with TemporaryDirectory() as folder_of_masks:
-            named = _named_masks(masks, Path(folder_of_masks)) if masks else None
-            registered = reconstruct(images, names, groups, cache, seed, threads, progress, named)
-        write_json(record, {"key": key, "registered": registered})
-    _check_registered(images, names, registered, progress)
+        known = {"key": key, **_solved(images, names, masks, cache, seed, threads, progress)}
+        write_json(record, known)
+    if known["unreadable"]:
+        lost = f"{len(known['unreadable'])} of {len(names)} photographs are no images that can be read, left out"
+        progress.warn(f"{lost}: {name_some(known['unreadable'])}")
+    readable = [name for name in names if name not in set(known["unreadable"])]
+    _check_registered(images, readable, known["registered"], progress)
     found = frames_of_model(folder, cache / "sparse", images, config)
     progress.say("the edges will be in the frame of this reconstruction, whose scale and axes are its own")
     return found
+
+
+def _solved(images, names, masks, cache, seed, threads, progress):
+    """Structure from motion, its model in `cache`: what is recorded of it.
+
+    registered, unreadable: names of photographs. files: {name: digest} of the model's.
+    """
+    groups = _by_camera(images, names, threads)
+    grouped = {name for group in groups for name in group}
+    readable = [name for name in names if name in grouped]
+    _refuse_few(images, readable)
+    with TemporaryDirectory() as folder_of_masks:
+        named = _named_masks(masks, Path(folder_of_masks)) if masks else None
+        registered = reconstruct(images, readable, groups, cache, seed, threads, progress, named)
+    return {
+        "registered": registered,
+        "unreadable": [name for name in names if name not in grouped],
+        "files": _digests(cache / "sparse") if registered else {},
+    }
+
+
+def _refuse_few(images, names):
+    if len(names) < FEWEST:
+        raise UserError(f"{images}: {len(names)} photographs are too few to find where they were taken; {ADVICE}")
 
 
 def _named_masks(masks, folder):
@@ -114,25 +138,35 @@ def _whole(frames, progress):
 
 
 def _known(record, key, cache):
-    """The names that an earlier run has registered from the same photographs, None where there was none."""
+    """What `_solved` gave for the same photographs; None where it did not, or its model is not as it was written."""
     try:
         content = json.loads(record.read_text(encoding="utf-8"))
-        registered = content["registered"] if content["key"] == key else None
-    except (OSError, ValueError, KeyError, TypeError):
+        files = _digests(cache / "sparse") if content["registered"] else {}
+        same = content["key"] == key and content["files"] == files and isinstance(content["unreadable"], list)
+    except (OSError, ValueError, KeyError, TypeError, UserError):
         return None
-    return registered if registered is None or not registered or model_files(cache / "sparse") else None
+    return content if same else None
+
+
+def _digests(folder):
+    """{name: digest} of the files of the COLMAP model in a folder."""
+    return {path.name: digest_file(path) for path in model_files(folder)}
 
 
 def _by_camera(images, names, threads):
-    """Lists of names that share a camera: of one folder, one size, one focal length."""
+    """Lists of names that share a camera: of one folder, one size, one focal length; without what is no image."""
 
     def kind(name):
-        focal = known_focal_length(images / name)
+        try:
+            focal = known_focal_length(images / name)
+        except UserError:
+            return None
         return str(Path(name).parent), picture_size(images / name), focal and round(focal, 1)
 
     with ThreadPoolExecutor(threads) as pool:
         kinds = list(pool.map(kind, names))
-    return [[name for name, other in zip(names, kinds, strict=True) if other == each] for each in dict.fromkeys(kinds)]
+    different = dict.fromkeys(filter(None, kinds))
+    return [[name for name, other in zip(names, kinds, strict=True) if other == each] for each in different]
 
 
 def _check_registered(images, names, registered, progress):

@@ -7,10 +7,10 @@ What needs none of it is used where it lies.
 
 import json
 import os
-from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
+from itertools import count
 from pathlib import Path, PurePosixPath
 from threading import Lock
 
@@ -20,7 +20,7 @@ import numpy as np
 from taichi_edges.artefacts import digest, digest_file, replacing, write_json
 from taichi_edges.detectors.pictures import light_of_srgb, srgb_of_light
 from taichi_edges.errors import UserError
-from taichi_edges.photogrammetry import Lens, distorted_pixels, undistorted
+from taichi_edges.photogrammetry import Lens, colmap_version, distorted_pixels, undistorted
 from taichi_edges.progress import Progress
 from taichi_edges.readers.frames import LEAVE_OUT, is_usable, refuse_views
 from taichi_edges.readers.picture_sizes import picture_size
@@ -61,10 +61,11 @@ class Plan:
         return np.array(self.intrinsics)
 
 
-def undistorted_frames(frames, folder, max_size, gamma=None, threads=None, progress=Progress()):
+def undistorted_frames(frames, folder, max_size, gamma=None, threads=None, progress=Progress(), kinds=tuple(FOLDERS)):
     """Frames whose pictures pinhole cameras took, all of one size; written to `folder` where they were not.
 
     max_size: px of the longest side from which on photographs are made smaller, 0: never. gamma: see `as_picture`.
+    kinds: the fields of Frames whose pictures are wanted, of FOLDERS; where others would be made, there are none.
     """
     sizes = _picture_sizes(frames, threads)
     as_told = len(set(sizes)) == 1 and frames.size in (None, sizes[0])
@@ -72,7 +73,7 @@ def undistorted_frames(frames, folder, max_size, gamma=None, threads=None, progr
         return frames  # small ones need nothing, and what is not as the layout says is refused later
     _check_lenses(frames, sizes, progress)
     plans = _plans(frames, sizes, max_size)
-    made = _make_all(frames, plans, Path(folder), gamma, threads, progress)
+    made = _make_all(frames, plans, kinds, Path(folder), gamma, threads, progress)
     return replace(
         frames,
         intrinsics=[plan.intrinsics_for for plan in plans],
@@ -212,24 +213,34 @@ def _unfolded(pixels, centre):
     return forward & (labels == labels[row, column])
 
 
-def _make_all(frames, plans, folder, gamma, threads, progress):
+def _make_all(frames, plans, kinds, folder, gamma, threads, progress):
     """The paths of the pictures, by field of Frames: those that were made, and those that need not be."""
     index = folder / "index.json"
     known = _known(index)
     valid = _valid_areas(plans, folder, known)
     paths = {**{key: list(getattr(frames, key)) for key in FOLDERS}, "valid_paths": valid}
     jobs = []
-    for view, (name, plan) in enumerate(zip(frames.names, plans, strict=True)):
+    for view, (name, plan) in enumerate(zip(_file_names(frames.names), plans, strict=True)):
         for key, kind in FOLDERS.items():
             source = paths[key][view]
             if is_usable(source) and not (plan.changes_nothing and picture_size(source) == plan.canvas):
-                target = folder / kind / f"{_safe(name)}.png"
+                target = folder / kind / f"{name}.png" if key in kinds else ""
                 paths[key][view] = target
-                jobs.append((Path(source), target, kind, plan))
-    names = Counter(target for _, target, _, _ in jobs)
-    assert max(names.values(), default=1) == 1, names.most_common(1)
+                jobs += [(Path(source), target, kind, plan)] if target else []
     _make(jobs, folder, known, gamma, threads, progress)
     return paths
+
+
+def _file_names(names):
+    """The views' names as paths that stay in their folder; those that would be the same are numbered."""
+    safe, found = [_safe(name) for name in names], []
+    used, wanted = set(), set(safe)
+    for name in safe:
+        if name in used:
+            name = next(new for k in count(2) if (new := f"{name}-{k}") not in used | wanted)
+        used.add(name)
+        found.append(name)
+    return found
 
 
 def _safe(name):
@@ -249,7 +260,7 @@ def _make(jobs, folder, known, gamma, threads, progress):
     """Make the pictures that are not there as they should be; (source, target, kind, Plan) each."""
     keys = [_key(source, kind, plan, gamma) for source, _, kind, plan in jobs]
     labels = [target.relative_to(folder).as_posix() for _, target, _, _ in jobs]
-    due = [i for i, (_, target, _, _) in enumerate(jobs) if known.get(labels[i]) != keys[i] or not target.is_file()]
+    due = [i for i, (_, target, _, _) in enumerate(jobs) if not _is_as_made(target, known.get(labels[i]), keys[i])]
     if not due:
         return
     maps, exponent = _Maps(kept=max(threads or os.cpu_count(), 1)), gamma or None
@@ -264,14 +275,29 @@ def _make(jobs, folder, known, gamma, threads, progress):
     try:
         with progress.track("undistort", len(due)) as report, ThreadPoolExecutor(threads) as pool:
             for done, i in enumerate(pool.map(make, due)):
-                known[labels[i]] = keys[i]
+                known[labels[i]] = _entry(keys[i], jobs[i][1])
                 report(done + 1)
     finally:
         write_json(folder / "index.json", known)
 
 
+def _entry(key, target):
+    """What the index holds about a picture: what it was made from, and what was written."""
+    return {"key": key, "digest": digest_file(target)}
+
+
+def _is_as_made(target, entry, key):
+    """Whether a picture is there, made from the same, and still what was written."""
+    return target.is_file() and entry == {"key": key, "digest": digest_file(target)}
+
+
 def _key(source, kind, plan, gamma):
-    return digest([METHOD, kind, digest_file(source), asdict(plan), gamma if kind == "images" else None])
+    return digest([*_method(plan), kind, digest_file(source), asdict(plan), gamma if kind == "images" else None])
+
+
+def _method(plan):
+    """What determines the result beside its inputs; COLMAP's lenses where there is one."""
+    return METHOD, colmap_version() if plan.lens else None
 
 
 def _read(path):
@@ -355,14 +381,14 @@ def _valid_areas(plans, folder, known):
     """(V,) pictures of where each view shows something, 255, or nothing, 0; '' where it does everywhere."""
     paths = {}
     for plan in dict.fromkeys(plans):
-        key = digest([METHOD, asdict(plan)])
+        key = digest([*_method(plan), asdict(plan)])
         target = folder / "valid" / f"{key[:16]}.png"
         label = f"valid/{target.name}"
-        if label not in known or (known[label] and not target.is_file()):
+        if known.get(label) != "" and not _is_as_made(target, known.get(label), key):
             area = _valid_area(plan)
             if not area.all():
                 _write(target, np.uint8(255) * area)
-            known[label] = "" if area.all() else key
+            known[label] = "" if area.all() else _entry(key, target)
             write_json(folder / "index.json", known)
         paths[plan] = target if known[label] else ""
     return [paths[plan] for plan in plans]
