@@ -188,7 +188,7 @@ def test_a_model_without_points_needs_a_box_from_the_scene(tmp_path, poses):
         picture = cv2.rectangle(np.zeros(SIZE[::-1], np.uint8), (100 + view, 70), (220, 170), 200, -1)
         cv2.imwrite(str(tmp_path / "images" / name), picture)
     (tmp_path / "run").mkdir()
-    with pytest.raises(UserError, match="images.bin: only 0 points fit well enough .*; set box"):
+    with pytest.raises(UserError, match="images.bin: the model has no points to tell where the scene is; set box"):
         stages.prepare(Run(scene(tmp_path), tmp_path / "run"))
     with pytest.raises(UserError, match="train.seeds is 'points', but the model has none"):
         box = [[0, 0, 0], [1, 1, 1]]

@@ -215,6 +215,11 @@ def neighbor_views(views):
     return chosen
 
 
+def can_sweep(views):
+    """Whether any view has enough neighbours to be swept."""
+    return any(len(others) >= TOGETHER for others in neighbor_views(views))
+
+
 def camera_centres(views):
     """(V, 3) unit cube."""
     rotations, offsets = views.world_to_camera[:, :, :3], views.world_to_camera[:, :, 3]
