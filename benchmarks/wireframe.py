@@ -127,13 +127,13 @@ def merged(loose, views, config):
 
 def extended(loose, views, config):
     """Free ends go as far as the images show the edge, what they do not show goes; then strokes are merged again."""
-    return Wireframe.loose(whole_edges(loose.shapes, EdgelMatching(views))[0])
+    return Wireframe.loose(whole_edges(loose.shapes, EdgelMatching(views), config)[0])
 
 
 def joined(loose, views, config):
     """Edges end in shared vertices, and short lines that are missing between these are found."""
     matching = EdgelMatching(views)
-    shapes = whole_edges(loose.shapes, matching)[0]
+    shapes = whole_edges(loose.shapes, matching, config)[0]
     return completed(connected(shapes, matching.pixel), matching)[0]
 
 

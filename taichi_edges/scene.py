@@ -431,11 +431,15 @@ PHOTOGRAPHED = {
         "harvest": False,
         "grow": 0.0,
     },
-    "cluster": {"min_points": 5, "max_gap": 0.015},
+    "cluster": {"min_points": 5, "max_gap": 0.03},
     "refine": {"min_support": 0.15, "min_views": 2.0, "min_steadiness": 0.3},
 }
 # Photographers walk along facades, so that the depth of horizontal edges is for others to tell.
-SURROUNDING = {**PHOTOGRAPHED, "refine": {**PHOTOGRAPHED["refine"], "anchor": True}}
+SURROUNDING = {
+    **PHOTOGRAPHED,
+    "cluster": {**PHOTOGRAPHED["cluster"], "max_gap": 0.015},
+    "refine": {**PHOTOGRAPHED["refine"], "anchor": True},
+}
 SCALES = {
     "part": {"paper": {}, "fast": {}},
     "object": {"paper": {}, "fast": PHOTOGRAPHED},

@@ -325,7 +325,8 @@ def part_project(tmp_path_factory):
 def test_edges_come_out_in_the_frame_and_scale_of_colmap(part_project, tmp_path):
     folder, part, into_colmap = part_project
     told = Told()
-    (tmp_path / "part.yaml").write_text(f"source: {{reader: colmap, path: {folder}}}\ntrain: {{steps: 120}}\n")
+    source = f"source: {{reader: colmap, path: {folder}}}"
+    (tmp_path / "part.yaml").write_text(f"scale: part\n{source}\ntrain: {{steps: 120}}\n")
     run = Run(load_scene(tmp_path / "part.yaml"), tmp_path / "run", threads=2, progress=told)
     record = run_stages(run, until="refine")
     facts = record["stages"]["prepare"]["facts"]

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from taichi_edges.errors import UserError
-from taichi_edges.scene import PRESETS, SCALES, SceneConfig
+from taichi_edges.scene import PRESETS, SCALES, SCALES_OF_READERS, SceneConfig
 from taichi_edges.scene_file import check_scene, load_scene
 
 SCENES = sorted((Path(__file__).parent.parent / "scenes").glob("*.yaml"))
@@ -399,6 +399,25 @@ def test_a_scale_on_the_command_line_replaces_that_of_the_scene(scene):
     assert (config.scale, config.train.orient_weight) == ("object", 0.1)
     config = load_scene(scene("train: {orient_weight: 0.5}"), preset="paper", scale="room")
     assert (config.scale, config.train.orient_weight) == ("room", 0.01)
+
+
+@pytest.mark.parametrize("reader, expected", SCALES_OF_READERS.items())
+def test_photographs_are_taken_for_what_their_reader_reads(scene, reader, expected):
+    source = f"source: {{reader: {reader}, path: there}}\n"
+    config = load_scene(scene(source, base=""))
+    assert config.scale == expected and config.train.seeds == "sweep" and config.source.min_chain > 0
+    part = load_scene(scene(f"{source}scale: part", base=""))
+    assert part.scale == "part" and part.train.seeds == "votes" and part.source.min_chain == 0
+    assert load_scene(scene(source, base=""), scale="room").refine.anchor
+
+
+@pytest.mark.parametrize("reader", ["emap", "nerf"])
+def test_renderings_are_parts_whose_settings_are_those_of_the_preset(scene, reader):
+    config = load_scene(scene(f"source: {{reader: {reader}, path: there}}", base=""))
+    assert config.scale == "part" and SCALES["part"] == {"fast": {}, "paper": {}}
+    assert (config.train.seeds, config.source.min_chain, config.source.tolerance_px) == ("votes", 0, 0.5)
+    kept = config.filter.min_views, config.filter.min_angle, config.refine.min_support, config.refine.min_steadiness
+    assert kept == (3.0, 15.0, 0.0, 0.66) and not config.refine.anchor
 
 
 def test_an_unknown_scale_is_refused(scene):

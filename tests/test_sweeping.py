@@ -163,6 +163,11 @@ def test_views_that_see_nothing_in_common_give_nothing(taichi, generator):
     assert len(sweep_seeds(views).points) == 0
 
 
+def test_rays_that_miss_the_box_give_nothing(taichi, generator):
+    corner = replace(views_of(CURVES, generator), box=np.array([[0.0, 0, 0], [0.05, 0.05, 0.05]]))
+    assert len(sweep_seeds(corner).points) == 0
+
+
 def test_no_edgels_and_no_long_chains_give_nothing(taichi, generator):
     assert len(sweep_seeds(without_edgels(8)).points) == 0
     short = cluttered(without_edgels(8), generator, strokes=50, length=sweeping.LEAST_CHAIN // 2)
@@ -213,6 +218,15 @@ def test_neighbours_see_the_same_from_elsewhere():
         near = np.flatnonzero((angles[view] > 3) & (angles[view] < 45))
         assert view not in others and (angles[view][others] < 75).all()  # 50 degrees somewhere in the cube
         assert len(set(others)) == sweeping.MOST_NEIGHBORS or set(near) <= set(others)
+
+
+def test_of_neighbours_that_see_as_much_those_apart_are_chosen(monkeypatch):
+    centres = np.column_stack([np.arange(9.0), np.zeros((9, 2))])  # a row of cameras
+    monkeypatch.setattr(sweeping, "MOST_NEIGHBORS", 3)
+    assert sweeping.best_and_apart(np.array([5, 5, 5, 5, 0, 5, 5, 5, 5]), centres, 4).tolist() == [0, 8, 2]
+    assert sweeping.best_and_apart(np.array([5, 5, 9, 5, 0, 8, 5, 5, 5]), centres, 4).tolist() == [2, 5, 8]
+    assert sweeping.best_and_apart(np.array([0, 0, 0, 7, 0, 0, 0, 0, 0]), centres, 4).tolist() == [3]
+    assert sweeping.best_and_apart(np.zeros(9, int), centres, 4).tolist() == []
 
 
 def test_pixels_beside_edgels_know_the_nearest_ones_direction(taichi, generator):

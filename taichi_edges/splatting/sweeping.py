@@ -46,9 +46,11 @@ SIGHTED = 2000  # seeds that tell how many views see a place
 
 @dataclass(frozen=True)
 class SweepSeeds:
-    """points, directions: (n, 3) unit cube. views: (n,) that agree, the reference included. companions: (n,) see
-    `companions_of`. pixel: (n,) size of a pixel at each point, unit-cube units. references: number of edgels whose rays
-    were swept.
+    """Places on the rays of edgels where the neighbours of their views agree on the direction of an edge.
+
+    points, directions: (n, 3) unit cube. views: (n,) that agree, the reference included. companions: (n,) see
+    `companions_of`. pixel: (n,) size of a pixel at each point, unit-cube units. references: edgels whose rays were
+    swept.
     """
 
     points: np.ndarray
@@ -182,7 +184,10 @@ def count_in(tally, b):
 
 
 def direction_maps(edgels, height, width):
-    """(V, H, W) uint8 on the device: where edgels run, see `stamp_directions`; and cosines and sines of the codes."""
+    """(V, H, W) uint8 codes of directions of Edgels, see `stamp_directions`; cosines and sines (CODES + 1,) of codes.
+
+    All on the device. height, width: pixels.
+    """
     angles = np.arctan2(edgels.normals[:, 1], edgels.normals[:, 0]) % np.pi
     code = np.minimum(np.floor(angles / np.pi * CODES), CODES - 1) + 1
     elements = np.column_stack([edgels.points, code]).astype(np.float32)
@@ -209,15 +214,28 @@ def neighbor_views(views):
     for view in range(len(views)):
         cosines = (towards * towards[view]).sum(axis=2)
         good = seen & seen[view] & (cosines < np.cos(LEAST_ANGLE)) & (cosines > np.cos(MOST_ANGLE))
-        counts = good.sum(axis=1)
-        order = np.argsort(-counts, kind="stable")
-        chosen.append(order[counts[order] > 0][:MOST_NEIGHBORS])
+        chosen.append(best_and_apart(good.sum(axis=1), centres, view))
     return chosen
 
 
 def can_sweep(views):
     """Whether any view has enough neighbours to be swept."""
     return any(len(others) >= TOGETHER for others in neighbor_views(views))
+
+
+def best_and_apart(counts, centres, view):
+    """Indices of at most MOST_NEIGHBORS views with the largest counts that are not 0, the best first.
+
+    Of equal ones that which is farthest from those before it, and from the view: where all see the whole scene, they
+    shall not be six beside each other. counts: (V,). centres: (V, 3) of the cameras.
+    """
+    found, apart = [], np.linalg.norm(centres - centres[view], axis=1)
+    counts = counts.copy()
+    while len(found) < MOST_NEIGHBORS and counts.any():
+        found.append(int(np.argmax(np.where(counts == counts.max(), apart, -1.0))))
+        apart = np.minimum(apart, np.linalg.norm(centres - centres[found[-1]], axis=1))
+        counts[found[-1]] = 0
+    return np.array(found, np.int64)
 
 
 def camera_centres(views):
@@ -227,7 +245,12 @@ def camera_centres(views):
 
 
 def sweep_view(views, view, chosen, others, maps):
-    """Candidate points (k, 3), directions (k, 3), counts of views (k,), pixel sizes (k,) of the chosen edgels."""
+    """Candidate points and directions (k, 3), counts of views (k,) and pixel sizes (k,) of the chosen edgels of a view.
+
+    chosen: (m,) bool, of its edgels. others: indices of its neighbours, at least TOGETHER. maps: `direction_maps`.
+    The step in inverse depth is that of STEP_PX along the epipolar line of the farthest neighbour: 1 / NEAREST of it
+    are far fewer than the 2^31 / ANGLES that a candidate can tell.
+    """
     pixels, normals, _ = views.edgels.of_view(view)
     pixels, normals = pixels[chosen].astype(np.float64), normals[chosen].astype(np.float64)
     lens, pose = views.intrinsics[view], views.world_to_camera[view]
@@ -242,6 +265,8 @@ def sweep_view(views, view, chosen, others, maps):
     baselines = np.linalg.norm(centres[others] - centre, axis=1)
     near = np.maximum(near, max(NEAREST, np.sort(baselines)[TOGETHER - 1] / np.tan(MOST_ANGLE)))
     good = far > near
+    if not good.any():
+        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int), np.zeros(0)
     rays, planes, near, far = rays[good], planes[good], near[good], far[good]
     projections = views.intrinsics[others] @ views.world_to_camera[others]
     epipoles = projections @ np.append(centre, 1.0)
@@ -263,14 +288,17 @@ def sweep_view(views, view, chosen, others, maps):
 
 
 def through_box(origin, rays, box):
-    """Where rays enter and leave the box, in multiples of the rays; not in order where they miss it."""
+    """Where (n, 3) rays enter and leave the box (2, 3), (n,) in multiples of them; not in order where they miss it."""
     with np.errstate(divide="ignore", invalid="ignore"):  # along a side: infinite; in a side: NaN, which is not inside
         sides = (box[:, None] - origin) / rays
     return np.minimum(*sides).max(axis=1), np.maximum(*sides).min(axis=1)
 
 
 def references(edgels, lengths):
-    """(e,) bool: one edgel in each cell of EVERY_PX px, on a chain that is long; the one on the longest chain."""
+    """(e,) bool: one of the Edgels in each cell of EVERY_PX px, that on the longest chain, if this is long.
+
+    lengths: (e,) edgels on the chain of each.
+    """
     good = np.flatnonzero(lengths >= LEAST_CHAIN)
     cells = np.floor(edgels.points[good] / EVERY_PX).astype(np.int64)
     keys = (edgels.views[good] * 100_000 + cells[:, 1]) * 100_000 + cells[:, 0]
@@ -282,7 +310,7 @@ def references(edgels, lengths):
 
 
 def sweep_seeds(views, report=None):
-    """SweepSeeds of all views. report: called with the number of views done."""
+    """SweepSeeds of all views. ti.init must have been called. report: called with the number of views done."""
     maps = direction_maps(views.edgels, views.height, views.width)
     chosen = references(views.edgels, chain_lengths(views.edgels))
     parts = [(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int), np.zeros(0))]
@@ -300,7 +328,8 @@ def sweep_seeds(views, report=None):
 def companions_of(points, directions, counts, pixel):
     """(n,) how many views more than chance's agree on candidates nearby on the same line, for each candidate.
 
-    What is nearby is a matter of pixels at the candidate, so that it is looked for among those of about its pixel size.
+    points, directions: (n, 3) unit cube. counts: (n,) views that agree on each; two always do. pixel: (n,) unit-cube
+    units. What is nearby is a matter of pixels at the candidate, and is looked for among those of about its pixel size.
     """
     companions = np.zeros(len(points), int)
     octaves = np.floor(np.log2(pixel)).astype(int)
