@@ -19,7 +19,7 @@ class OneLineParser(argparse.ArgumentParser):
 def parse_arguments(arguments=None):
     """The command line; kept free of heavy imports so that --help answers at once."""
     parser = OneLineParser(
-        description="Recover the 3D edges of a scene: prepare, train, cluster, fit, evaluate, export.",
+        description=f"Recover the 3D edges of a scene: {', '.join(STAGES)}.",
         epilog="A stage that is up to date is skipped, so the same command resumes an interrupted run.",
     )
     parser.add_argument("scene", help="scene file, e.g. scenes/demo.yaml, or a folder: COLMAP, nerfstudio, photos, ...")

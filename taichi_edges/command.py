@@ -8,7 +8,8 @@ from pathlib import Path
 from taichi_edges.errors import UserError
 from taichi_edges.pipeline import STAGES, Run, expand, run_stages
 from taichi_edges.progress import make_progress
-from taichi_edges.scene_file import load_scene
+from taichi_edges.scene_file import is_source, load_scene
+from taichi_edges.stages import read_facts
 
 MOST_THREADS = 256  # each has a plane of its own to draw into
 
@@ -29,6 +30,8 @@ def run_command(options):
     )
     if config.source.reader == "auto":
         run = with_reader(run)
+    if is_source(Path(options.scene)):
+        _refuse_results_of_another(run)
     record = run_stages(run, options.stage, options.until)
     print_summary(run, record, options.until)
     if options.show:
@@ -54,6 +57,22 @@ def with_reader(run):
     source, found = recognised_source(path, run.config.source)
     run.progress.say(f"{path}: read as {found}")
     return replace(run, config=run.config.model_copy(update={"source": source}))
+
+
+def _refuse_results_of_another(run):
+    """UserError where the run's folder holds the results of another source: folders in two places may be called alike.
+
+    Only where the name is the folder's; in a scene file the user has chosen it.
+    """
+    try:
+        scene = read_facts(run.path("run.json"))["scene"]
+        before, name = Path(scene["source"]["path"]), scene["name"]
+    except (KeyError, TypeError):
+        return
+    before = before if before.is_absolute() else (run.data_root or Path()) / before
+    if name == run.config.name and before.resolve() != Path(run.config.source.path).resolve():
+        problem = f"holds the results of {before}"
+        raise UserError(f"{run.folder}: {problem}; name others with --out FOLDER or --set name=NAME, or delete it")
 
 
 def _data_root(option):

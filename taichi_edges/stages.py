@@ -27,6 +27,7 @@ from taichi_edges.wireframe import read_wireframe, write_wireframe
 WIDEST_PX = 40.0  # of a detector's lines
 UNIT_CUBE = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 WRONG_CAMERAS = "poses or intrinsics may not be those of these images (their order, axes or scale)"
+HARDLY_BETTER = 1.5  # times chance: right cameras give three times as much and more
 CALIBRATION_SEEDS = 4000  # 3D points through which a detector's biases are measured, at most
 
 
@@ -95,9 +96,9 @@ def _scene_box(run, frames):
             f"scene box {corners}, in units of the cameras, as the layout has it; the key box sets another"
         )
         return frames.box, "reader"
-    if frames.points is not None:
-        found = f"{len(frames.points)} points fit well enough to tell where the scene is"
-        raise UserError(f"{frames.where}: only {found}; set box, or raise source.max_point_error")
+    if frames.points is not None:  # a reader takes even points that fit badly rather than none
+        found = f"only {amount(len(frames.points), 'good point')}" if len(frames.points) else "no points"
+        raise UserError(f"{frames.where}: the model has {found} to tell where the scene is; set box")
     return UNIT_CUBE, "unit cube"
 
 
@@ -175,9 +176,10 @@ def _finish_views(run, views, frames=None):
         if calibration is not None:
             facts["calibration"] = calibration.facts()
             residuals = {"residuals": calibration.residuals, "on_silhouette": calibration.on_silhouette}
-    sheet = _write_sheet(run, views, residuals)
     if run.config.source.min_chain:
-        views = _chained(run, views)
+        views, kept = _chained(run, views)
+        residuals = {name: values[kept] for name, values in residuals.items()}
+    sheet = _write_sheet(run, views, residuals)
     facts["edgels"] = len(views.edgels)
     write_views(run.path("views.npz"), views)
     write_views(run.path("held_out.npz"), held_out)
@@ -185,18 +187,20 @@ def _finish_views(run, views, frames=None):
 
 
 def _chained(run, views):
-    """The views with the edgels on long chains, and maps drawn through these."""
-    from taichi_edges.detectors.chains import with_long_chains
+    """The views with the edgels on long chains, and maps drawn through these; and which of all edgels those are."""
+    from taichi_edges.detectors.chains import with_chain_strengths
     from taichi_edges.detectors.drawing import draw_edge_maps
     from taichi_edges.kernels.device import start_taichi
 
     start_taichi("cpu", run.threads, run.config.seed, run.kernel_cache)
-    edgels = with_long_chains(views.edgels, run.config.source.min_chain, views.height, views.width)
+    edgels, lengths = with_chain_strengths(views.edgels, views.height, views.width)
+    kept = lengths >= run.config.source.min_chain
+    edgels = edgels.keep(kept)
     if len(edgels) == 0:
         problem = f"no edge is {run.config.source.min_chain} px long in any of {len(views)} views"
         raise UserError(f"source.min_chain: {problem}; lower it, or look at detection.png of a run with 0")
     maps = draw_edge_maps(edgels, views.height, views.width, run.threads)
-    return replace(views, edgels=edgels, edge_maps=maps)
+    return replace(views, edgels=edgels, edge_maps=maps), kept
 
 
 def _masked(run, views, frames, redraw):
@@ -395,15 +399,13 @@ def _start(run, views, generator):
     from taichi_edges.exporters.ply import read_vertices, stack_fields
     from taichi_edges.splatting.gaussians import start_gaussians
     from taichi_edges.splatting.seeding import LEAST_VOTED, given_points, random_points, voted_gaussians
-    from taichi_edges.splatting.sweeping import swept_gaussians
 
     config = run.config.train
     seeds = config.seeds
     if seeds in ("votes", "sweep"):
+        found, seeds = _swept(run, views) if seeds == "sweep" else (None, seeds)
         if seeds == "votes":
             found = voted_gaussians(views, config.edge_threshold, config.gaussians, config.initial_opacity, generator)
-        else:
-            found = swept_gaussians(views, config.gaussians, config.initial_opacity, run.progress)
         if found is not None:
             return found
         seeds = "points" if run.path("seeds.ply").is_file() else "random"
@@ -419,6 +421,18 @@ def _start(run, views, generator):
             more = random_points(config.gaussians - len(points), views.box, generator)
             points = np.concatenate([points, more])
     return start_gaussians(points, generator, config.initial_scale, config.initial_opacity)
+
+
+def _swept(run, views):
+    """Gaussians by sweeping, None where views agree in too few places; and the seeds to use: 'votes' if none can be."""
+    from taichi_edges.splatting.sweeping import TOGETHER, can_sweep, swept_gaussians
+
+    found = swept_gaussians(views, run.config.train.gaussians, run.config.train.initial_opacity, run.progress)
+    if found is not None or can_sweep(views):
+        return found, "sweep"
+    problem = f"fewer than {TOGETHER + 1} views see the same, and the sweep needs so many"
+    run.progress.warn(f"{problem}: take more pictures, each from near the one before; the training starts from votes")
+    return None, "votes"
 
 
 def seed_files(run):
@@ -541,10 +555,19 @@ def evaluate(run):
             edges.transformed(partial(transform, views.input_to_truth)) if truth.own_frame else unit, truth
         )
     metrics |= held_out_metrics(exact_polylines(unit), views, held_out)
+    _warn_of_chance(metrics, run.progress)
     metrics["ground_truth"] = truth and truth.source
     write_json(run.path("metrics.json"), metrics)
     _write_csv(run.path("metrics.csv"), [("metric", "value"), *metrics.items()])
     return {**metrics, "files": _write_pseudo_truth(run, views, truth)}
+
+
+def _warn_of_chance(metrics, progress):
+    """Say so where the edges are hardly better in the held-out views than edges displaced at random would be."""
+    found, chance = (metrics.get(f"held_out_{name}_percent") for name in ("precision", "chance"))
+    if found is not None and chance is not None and found < HARDLY_BETTER * chance:
+        problem = f"only {found:.0f} % of the edges fit the held-out views, where chance alone gives {chance:.0f} %"
+        progress.warn(f"{problem}: {WRONG_CAMERAS}")
 
 
 def _ground_truth(run, views, held_out):

@@ -190,7 +190,7 @@ def test_a_model_without_points_needs_a_box_from_the_scene(tmp_path, poses):
         picture = cv2.rectangle(np.zeros(SIZE[::-1], np.uint8), (100 + view, 70), (220, 170), 200, -1)
         cv2.imwrite(str(tmp_path / "images" / name), picture)
     (tmp_path / "run").mkdir()
-    with pytest.raises(UserError, match="images.bin: only 0 points fit well enough .*; set box"):
+    with pytest.raises(UserError, match="images.bin: the model has no points to tell where the scene is; set box"):
         stages.prepare(Run(scene(tmp_path), tmp_path / "run"))
     with pytest.raises(UserError, match="train.seeds is 'points', but the model has none"):
         box = [[0, 0, 0], [1, 1, 1]]
@@ -327,9 +327,8 @@ def part_project(tmp_path_factory):
 def test_edges_come_out_in_the_frame_and_scale_of_colmap(part_project, tmp_path):
     folder, part, into_colmap = part_project
     told = Told()
-    (tmp_path / "part.yaml").write_text(
-        f"scale: part\nsource: {{reader: colmap, path: {folder}}}\ntrain: {{steps: 120}}\n"
-    )
+    source = f"source: {{reader: colmap, path: {folder}}}"
+    (tmp_path / "part.yaml").write_text(f"scale: part\n{source}\ntrain: {{steps: 120}}\n")
     run = Run(load_scene(tmp_path / "part.yaml"), tmp_path / "run", threads=2, progress=told)
     record = run_stages(run, until="refine")
     facts = record["stages"]["prepare"]["facts"]

@@ -22,6 +22,7 @@ from taichi_edges.evaluation.held_out import (
 from taichi_edges.evaluation.metrics import average_per_voxel, exact_polylines, point_metrics
 from taichi_edges.evaluation.projected_curves import Camera, Chords
 from taichi_edges.pipeline import Run
+from taichi_edges.progress import Progress
 from taichi_edges.scene_file import check_scene
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import Imperfections, render_edge_maps, ring_cameras
@@ -297,3 +298,27 @@ def test_held_out_views_rank_results_as_the_distances_to_the_true_edges_do(brack
     in_views = [held_out_metrics(result, training, held_out)["held_out_f_score_percent"] for result in results.values()]
     found = dict(zip(results, zip(in_space, in_views, strict=True), strict=True))
     assert spearmanr(in_space, in_views).statistic >= 0.9, found
+
+
+class Warnings(Progress):
+    """Keeps the warnings."""
+
+    def __init__(self):
+        self.texts = []
+
+    def warn(self, text):
+        self.texts.append(text)
+
+
+def test_edges_that_fit_no_better_than_chance_are_told_from_those_that_fit(bracket):
+    """As with images in another order than their poses."""
+    part, views, held_out = bracket
+    edgels = held_out.edgels
+    exchanged = Edgels.of_views([edgels.of_view((view + 1) % len(held_out)) for view in range(len(held_out))])
+    told = Warnings()
+    for one in (held_out, replace(held_out, edgels=exchanged)):
+        stages._warn_of_chance(held_out_metrics(exact_polylines(part.edges), views, one), told)
+    (text,) = told.texts
+    assert "of the edges fit the held-out views, where chance alone gives" in text and "their order" in text
+    stages._warn_of_chance(held_out_metrics(exact_polylines(part.edges), views, split_views(views, [])[1]), told)
+    assert told.texts == [text]  # nothing is known without held-out views

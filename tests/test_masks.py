@@ -88,7 +88,7 @@ def test_wrong_masks_are_refused_in_one_line(tmp_path):
     points = np.array([[60.0, 50]])
     for mask, says in (
         (np.zeros((100, 120), np.uint8), "the masks leave no edge in any view"),
-        (disc(value=1), "invert or scale them"),
+        (disc(value=1), "images.bin: source.masks: .*: invert or scale them"),  # not where undistortion put it
         (np.zeros((100, 100), np.uint8), "the mask is 100 x 100 px, its image 120 x 100 px"),
     ):
         with pytest.raises(UserError, match=says):

@@ -255,3 +255,19 @@ def test_images_of_16_bits_calibrate_as_those_of_8_do(prepare, folder):
     for path in (folder / "color").iterdir():
         cv2.imwrite(str(path), cv2.imread(str(path)).astype(np.uint16) * 257)
     assert prepare(known)[0]["calibration"] == shallow
+
+
+@pytest.mark.parametrize("source", [{"edges": "edge_test"}, {"detector": "subpixel"}], ids=["calibrated", "subpixel"])
+def test_the_sheet_shows_what_the_training_gets(prepare, monkeypatch, source):
+    shown = {}
+    monkeypatch.setattr(
+        "taichi_edges.exporters.detection_sheet.write_detection_sheet",
+        lambda path, views, **residuals: shown.update(views=views, residuals=residuals),
+    )
+    facts, views, _ = prepare({**source, "min_chain": 30})
+    assert len(shown["views"].edgels) == len(views.edgels) == facts["edgels"] > 0
+    np.testing.assert_array_equal(shown["views"].edgels.points, views.edgels.points)
+    np.testing.assert_array_equal(shown["views"].edge_maps, views.edge_maps)
+    assert set(shown["residuals"]) == ({"residuals", "on_silhouette"} if "calibration" in facts else set())
+    assert all(len(values) == len(views.edgels) for values in shown["residuals"].values())
+    assert ("edges" in source) == ("calibration" in facts)

@@ -304,6 +304,18 @@ def test_a_missing_folder_is_named(kind, tmp_path):
     assert str(refused.value).startswith(str(where / LISTING[kind]))
 
 
+@pytest.mark.parametrize("where", ["masks", "masks/train"])
+def test_masks_of_nerf_are_found(nerf, where):
+    (nerf.path / where).mkdir(parents=True)
+    for view in range(VIEWS - 1):
+        cv2.imwrite(str(nerf.path / where / f"v{view}.png"), np.full((4, 4), 255, np.uint8))
+    nerf.read()
+    frames = READERS["nerf"](nerf.path, SourceConfig(reader="nerf", path="unused"))
+    assert frames.mask_paths == [*(nerf.path / where / f"v{view}.png" for view in range(VIEWS - 1)), ""]
+    assert "1 of" in frames.warnings[0] and f"v{VIEWS - 1}" in frames.warnings[0]
+    assert not any(READERS["nerf"](nerf.path, SourceConfig(reader="nerf", path="unused", masks="none")).mask_paths)
+
+
 def test_a_missing_split_is_named_with_the_one_there_is(nerf):
     nerf.listing.write_text("{}")
     assert "transforms_val.json: not found; did you mean 'transforms_train.json'?" in nerf.refusal(split="val")

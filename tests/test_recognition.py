@@ -14,6 +14,9 @@ from taichi_edges.readers.recognition import recognise, recognised_source, scene
 from taichi_edges.scene import SourceConfig
 
 ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT))
+from run import main  # noqa: E402
+
 FRAMES = json.dumps({"frames": [{}, {}]})
 
 
@@ -115,6 +118,30 @@ def test_what_is_no_layout_is_refused_with_what_is_there_and_what_is_known(tmp_p
     assert "photographs alone" in message and "\n" not in message
 
 
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        (["IMG_1.HEIC", "IMG_2.heic", "IMG_3.dng"], "1 .dng and 2 .heic files, which cannot be read; convert them to"),
+        (["photos/IMG_1.CR2"], "1 .cr2 files, which cannot be read; convert them to JPEG"),
+        (["walk.MP4"], "1 .mp4 files, which cannot be read; save single frames of them as JPEG"),
+    ],
+)
+def test_pictures_of_kinds_that_are_not_read_are_named_with_the_cure(tmp_path, names, says):
+    build(tmp_path, *names)
+    with pytest.raises(UserError) as refused:
+        recognise(tmp_path)
+    assert says in str(refused.value)
+
+
+def test_images_of_a_model_are_counted_where_they_are_not_in_the_usual_folder(tmp_path):
+    build(tmp_path, "a/x.jpg", "a/sparse/0/points3D.bin", "b/sparse/0/images.txt")
+    (tmp_path / "a/sparse/0/images.bin").write_bytes((7).to_bytes(8, "little"))
+    (tmp_path / "b/sparse/0/images.txt").write_text(
+        "# two images\n1 1 0 0 0 0 0 0 1 x.jpg\n\n2 1 0 0 0 0 0 0 1 y.jpg\n\n"
+    )
+    assert [recognise(tmp_path / name).views for name in "ab"] == [7, 2]
+
+
 def test_photographs_of_a_project_with_poses_say_so(tmp_path):
     build(tmp_path, "images/a.jpg", "sparse/0/images.bin")
     assert f"{tmp_path} is a COLMAP project, name that to use its poses" in str(recognise(tmp_path / "images"))
@@ -175,3 +202,27 @@ def test_an_unknown_folder_and_an_unknown_file_end_with_one_line(tmp_path):
         done = run(given, cwd=tmp_path)
         assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
     assert not (tmp_path / "runs").exists()
+
+
+def test_folders_of_one_name_do_not_share_their_results(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for place in ("one", "two"):
+        build(tmp_path / place / "shed", "meta_data.json", "color/a.png")
+    results = tmp_path / "runs" / "shed"
+    results.mkdir(parents=True)
+    scene = {"name": "shed", "source": {"path": str(tmp_path / "one" / "shed")}}
+    (results / "run.json").write_text(json.dumps({"scene": scene}))
+    assert main(["two/shed"]) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        f"error: runs/shed: holds the results of {tmp_path / 'one' / 'shed'};"
+        " name others with --out FOLDER or --set name=NAME, or delete it"
+    )
+    for arguments in (["one/shed"], ["two/shed", "--out", "others"], ["two/shed", "--set", "name=shed2"]):
+        assert main(arguments) == 2  # for want of poses
+        assert "a frame without rgb_path" in capsys.readouterr().err
+
+
+def test_the_help_lists_all_stages(capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    assert "fit, refine, evaluate" in " ".join(capsys.readouterr().out.split())

@@ -290,6 +290,14 @@ class Warned(Progress):
         self.lines.append(text)
 
 
+def test_three_views_are_too_few_to_sweep_and_start_from_votes(taichi, generator, tmp_path):
+    config = SceneConfig(source={"reader": "emap", "path": "there"}, train={"seeds": "sweep", "gaussians": 300})
+    warned, views = Warned(), views_of(CURVES, generator, count=3)
+    stages._start(Run(config, tmp_path, progress=warned), views, np.random.default_rng(0))
+    assert warned.lines[0].startswith("fewer than 4 views see the same")
+    assert warned.lines[0].endswith("the training starts from votes")
+
+
 def test_without_seeds_the_training_says_so_and_starts_from_random_points(taichi, tmp_path):
     config = SceneConfig(source={"reader": "emap", "path": "there"}, train={"seeds": "sweep", "gaussians": 300})
     warned = Warned()

@@ -158,6 +158,13 @@ def test_poses_in_other_units_than_the_box(scene, factor):
     assert scene.run(f"box={box}")[0] == 0
 
 
+def test_a_box_far_away_is_wrong_itself(scene):
+    """Of cameras all around something some look its way once they are flipped."""
+    scene.write_emap()
+    message = scene.refusal("box=[[1000, 1000, 1000], [1001, 1001, 1001]]")
+    assert "0 of 6 views see the scene box" in message and "correct the box (the cameras are around" in message
+
+
 @pytest.mark.parametrize(
     ("factor", "says"),
     [

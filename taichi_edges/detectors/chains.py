@@ -45,7 +45,13 @@ def chain_lengths(edgels):
 
 
 def with_long_chains(edgels, least, height, width):
-    """The Edgels on chains of at least `least` edgels, with the chain's say in how sure they are, and how they run.
+    """The Edgels on chains of at least `least` edgels, as `with_chain_strengths` makes them."""
+    edgels, lengths = with_chain_strengths(edgels, height, width)
+    return edgels.keep(lengths >= least)
+
+
+def with_chain_strengths(edgels, height, width):
+    """The Edgels with their chain's say in how sure they are and how they run, and (e,) the length of its chain each.
 
     An edgel is as sure as its whole chain, if each SURE_PX of that could be wrong by themselves, and its normal is the
     chain's there. ti.init must have been called. height, width: pixels.
@@ -55,4 +61,4 @@ def with_long_chains(edgels, least, height, width):
     edgels = with_smooth_normals(edgels, height, width)
     lengths = chain_lengths(edgels)
     doubt = (1.0 - edgels.strengths) ** np.maximum(lengths / SURE_PX, 1.0)  # a short chain says nothing against it
-    return replace(edgels, strengths=(1.0 - doubt).astype(np.float32)).keep(lengths >= least)
+    return replace(edgels, strengths=(1.0 - doubt).astype(np.float32)), lengths

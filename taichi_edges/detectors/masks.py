@@ -51,9 +51,8 @@ def within_masks(edgels, frames, size, progress):
         if part.stop > part.start and not keep[part].any():
             masked_out.append(frames.names[view])
     if len(edgels) and not keep.any():
-        where = Path(next(filter(None, frames.mask_paths), frames.where)).parent
-        problem = "the masks leave no edge in any view; white (128 and more of 255) is kept"
-        raise UserError(f"{where}: {problem}: invert or scale them, or set source.masks: none")
+        problem = "source.masks: the masks leave no edge in any view; white (128 and more of 255) is kept"
+        raise UserError(f"{frames.where}: {problem}: invert or scale them, or set source.masks: none")
     if masked_out:
         progress.warn(f"{len(masked_out)} of {len(frames.names)} masks leave no edge: {name_some(masked_out)}")
     return edgels.keep(keep)

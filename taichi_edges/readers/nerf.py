@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from taichi_edges.errors import UserError
+from taichi_edges.readers.companions import mask_folder, mask_paths
 from taichi_edges.readers.frames import Frames, matrix, read_json
 
 
@@ -23,6 +24,7 @@ def read_nerf(path, config):
         raise UserError(f"{where}: has no 'frames'; is this a transforms file of NEF or NeRF (Blender)?")
     paths = [_file_path(frame, where) for frame in frames]
     # NEF's frames name edge maps, which are grey, those of other NeRF scenes photographs.
+    masks, warnings = _masks(folder, config, paths)
     own_images = not config.edges and not config.images and _is_colour(folder / paths[0])
     return Frames(
         where=where,
@@ -34,7 +36,16 @@ def read_nerf(path, config):
         ],
         camera_to_world=[frame.get("transform_matrix") for frame in frames],
         opengl=True,
+        mask_paths=masks,
+        warnings=warnings,
     )
+
+
+def _masks(folder, config, paths):
+    """As `mask_paths`: masks at the images' own paths below their folder, or all of them beside each other in it."""
+    masks = mask_folder(folder, config)
+    nested = masks is not None and any((masks / path.parent).is_dir() for path in paths)
+    return mask_paths(folder, config, [str(path) if nested else path.name for path in paths])
 
 
 def _image(folder, config, path):

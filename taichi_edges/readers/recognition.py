@@ -16,6 +16,8 @@ KNOWN = (
 )
 SPLITS = ("train", "val", "test")
 PHOTO_FOLDERS = ("", "images", "photos", "image", "rgb", "color")
+OTHER_PHOTOS = {".heic", ".heif", ".avif", ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2"}
+FILMS = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm"}
 PARTS_OF_A_PROJECT = (
     "sparse",
     "colmap",
@@ -67,6 +69,7 @@ def recognise(path):
     photographs = _photographs(path)
     if photographs:
         return photographs
+    _refuse_other_pictures(path)
     unknown = "is a folder, not a scene file, and of no known layout"
     raise UserError(f"{path}: {unknown}; it holds {_contents(path)}; known are {KNOWN}")
 
@@ -142,7 +145,7 @@ def find_colmap(folder):
     project = _project_of(models[0])
     listing = models[0] if len(models) == 1 else models[0].parent
     source = {"model": str(folder.resolve().relative_to(project))} if models == [folder] != [project] else {}
-    return Found("colmap", "a COLMAP project", project, listing, _count_below(project / "images"), source)
+    return Found("colmap", "a COLMAP project", project, listing, _count_views(project, models[0]), source)
 
 
 def _models(folder):
@@ -156,6 +159,21 @@ def _project_of(model):
     if (model / "images").is_dir():
         return model
     return next((folder for folder in model.resolve().parents[:3] if (folder / "images").is_dir()), model)
+
+
+def _count_views(project, model):
+    """Images of a COLMAP project: those in its folder of images, else those that the model knows, wherever they are."""
+    return _count_below(project / "images") or _registered(model)
+
+
+def _registered(model):
+    """How many images a COLMAP model says it has."""
+    binary = model / "images.bin"
+    if binary.is_file():
+        with open(binary, "rb") as file:
+            return int.from_bytes(file.read(8), "little")
+    lines = (model / "images.txt").read_text(encoding="utf-8", errors="replace").splitlines()
+    return sum(not line.startswith("#") for line in lines) // 2  # an image, and its points, which may be none
 
 
 def _count_below(folder):
@@ -222,6 +240,17 @@ def _photographs(folder):
     around = next((found for find in FINDERS for found in [find(project)] if found), None)
     hint = f"; {project} is {around.layout}, name that to use its poses" if around else ""
     return Found("images", f"photographs without poses{hint}", place, place, len(image_files(place)))
+
+
+def _refuse_other_pictures(folder):
+    """UserError where there are photographs or films of kinds that are not read."""
+    files = [p for name in PHOTO_FOLDERS if (folder / name).is_dir() for p in (folder / name).iterdir() if p.is_file()]
+    suffixes = [path.suffix.lower() for path in files]
+    for kinds, cure in ((OTHER_PHOTOS, "convert them to JPEG"), (FILMS, "save single frames of them as JPEG")):
+        counts = {suffix: suffixes.count(suffix) for suffix in sorted(set(suffixes) & kinds)}
+        if counts:
+            found = " and ".join(f"{count} {suffix}" for suffix, count in counts.items())
+            raise UserError(f"{folder}: holds {found} files, which cannot be read; {cure}")
 
 
 FINDERS = (find_colmap, find_transforms, find_transforms_of_splits, find_meta_data, find_cameras)

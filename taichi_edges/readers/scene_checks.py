@@ -19,6 +19,7 @@ SMALLEST_BOX = 8.0  # px across: a box that spans less holds no edges
 MOST_POINTS = 2000  # points that are looked for in the views
 LEAST_SEEN = 0.2  # share of the points that LEAST_VIEWS must have in their images; a scan may be larger
 ENOUGH_SEEN = 0.5  # of the points, where something has been tried: that is it
+MOST_VIEWS = 0.5  # of all, must see the box where something has been tried
 UNITS = (1000.0, 0.001)  # millimetres for metres, and the other way round
 LEAVE_OUT = "or leave such views out with source.skip"
 
@@ -162,7 +163,10 @@ def _times(factor):
 
 
 def _what_helps(cameras, box, seeing):
-    """What makes more than `seeing` views see the box; None where nothing does."""
+    """What makes more than `seeing` views see the box, and most of all views; None where nothing does.
+
+    A few that look its way are chance: cameras all around something always have some that do.
+    """
     used, other = _axes(cameras)
     trials = {
         f"the poses were read with {used} axes; set source.axes: {other}": (cameras.flipped(), box),
@@ -174,7 +178,7 @@ def _what_helps(cameras, box, seeing):
         for cure, (trial, moved) in trials.items()
     }
     cure = max(counts, key=counts.get)
-    return cure if counts[cure] > seeing else None
+    return cure if counts[cure] > seeing and counts[cure] >= MOST_VIEWS * len(cameras.poses) else None
 
 
 def _where_they_are(cameras):

@@ -218,6 +218,11 @@ def neighbor_views(views):
     return chosen
 
 
+def can_sweep(views):
+    """Whether any view has enough neighbours to be swept."""
+    return any(len(others) >= TOGETHER for others in neighbor_views(views))
+
+
 def best_and_apart(counts, centres, view):
     """Indices of at most MOST_NEIGHBORS views with the largest counts that are not 0, the best first.
 
