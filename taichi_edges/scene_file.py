@@ -91,7 +91,7 @@ def load_scene(path, preset=None, settings=(), seed=None, scale=None, data_root=
     parsed = [(*_parse_setting(setting), setting) for setting in settings]
     if scale is None and "scale" not in content:
         content |= _scale_of_source({**_section(content), **_settings_of_source(parsed)}, data_root)
-    content = overlay(_starting_values(content.get("preset"), scale or content.get("scale")), content)
+    content = overlay(_starting_values(preset or content.get("preset"), scale or content.get("scale")), content)
     content = _overridden(content, preset, scale)
     origins = {}
     for keys, value, setting in parsed:

@@ -457,3 +457,11 @@ def test_a_reader_on_the_command_line_brings_its_scale(scene, photographs):
     assert load_scene(photographs / "thing", settings=["source.reader=colmap"]).scale == "building"
     named = scene("source: {path: thing}", base="")
     assert load_scene(named, settings=["source.reader=nerfstudio"]).scale == "building"
+
+
+def test_a_preset_on_the_command_line_leaves_nothing_of_the_other_one(scene):
+    """What the default preset says for buildings alone must not stay where the paper's has no word on it."""
+    path = scene("scale: building")
+    assert load_scene(path).source.min_chain > 0 and load_scene(path).refine.anchor
+    paper = load_scene(path, preset="paper")
+    assert paper.source.min_chain == 0 and not paper.refine.anchor and paper.filter.min_support == 0.05
