@@ -231,6 +231,7 @@ def test_of_neighbours_that_see_as_much_those_apart_are_chosen(monkeypatch):
 
 def test_pixels_beside_edgels_know_the_nearest_ones_direction(taichi, generator):
     points, angles = generator.uniform(-2, 42, (40, 2)), generator.uniform(0, 2 * np.pi, 40)
+    points[:5] = [[5, 5], [15, 5], [25, 5], [5, 25], [25, 25]] + generator.uniform(-0.5, 0.5, (5, 2))  # well inside
     normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     edgels = Edgels.of_views([(points, normals, np.ones(40)), (points[:5], normals[:5], np.ones(5))])
     codes, cosines, sines = direction_maps(edgels, 36, 40)
