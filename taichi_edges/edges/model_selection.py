@@ -227,7 +227,7 @@ def _distances_to_ellipse(shape, points):
     x, y = (offsets @ axis / radius for axis, radius in zip(shape.axes, shape.radii, strict=True))
     t = np.arctan2(y / shape.radii[1], x / shape.radii[0]) if shape.circular else np.arctan2(y, x)
     a, b = shape.radii
-    for _ in range(0 if shape.circular else 5):
+    for _ in range(0 if shape.circular else 12):  # of flat ellipses, near the evolute, the first ones are short
         cosine, sine = np.cos(t), np.sin(t)
         slope = (a * a - b * b) * sine * cosine - a * x * sine + b * y * cosine
         bend = (a * a - b * b) * (cosine**2 - sine**2) - a * x * cosine - b * y * sine
