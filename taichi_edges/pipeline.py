@@ -21,7 +21,7 @@ from pathlib import Path
 import yaml
 
 import taichi_edges
-from taichi_edges import stages
+from taichi_edges import preparing, stages
 from taichi_edges.artefacts import digest, digest_file, locked, remove_unfinished, write_json, write_text
 from taichi_edges.errors import UserError
 from taichi_edges.findings import FINDINGS
@@ -54,11 +54,11 @@ class Stage:
 
 STAGES = {
     "prepare": Stage(
-        stages.prepare,
+        preparing.prepare,
         ("source", "calibration", "box", "seed", "train.edge_threshold", "evaluation.held_out"),
         (),
         ("views.npz", "held_out.npz"),
-        stages.source_files,
+        preparing.source_files,
         packages=("pycolmap",),
     ),
     "train": Stage(

@@ -226,7 +226,6 @@ class FilterConfig(Section):
     )
     harvest: bool = Field(True, description="refine: look once more for edges seen in few views")
     grow: Share = Field(0.2, description="refine: continue edges where this share of the views agrees; 0: do not")
-    grow_step: Positive = Field(1.0, description="refine: of growing, pixels at the scene")
     outlier_neighbors: Annotated[int, Field(ge=0)] = Field(3, description="statistical outliers: neighbours; 0: off")
     outlier_deviations: Positive = Field(5.0, description="mean neighbour distance allowed, standard deviations")
 

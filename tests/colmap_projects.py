@@ -5,7 +5,7 @@ import numpy as np  # before pycolmap: see photogrammetry
 import pycolmap
 
 from taichi_edges.cameras import invert_pose
-from taichi_edges.detectors.pictures import light_of_srgb, srgb_of_light
+from taichi_edges.light import light_of_srgb, srgb_of_light
 from taichi_edges.synthetic.rendering import interpolated_normals, shade
 from taichi_edges.synthetic.visibility import ray_scene
 

@@ -7,8 +7,9 @@ import pytest
 from edgel_scenes import SIZE, blank_views, line, pixel_of, views_of
 
 from taichi_edges.edgels import Edgels
-from taichi_edges.edges.anchoring import LEAST_LENGTH_PX, anchored_lines, runs_of, straight_runs
+from taichi_edges.edges.anchoring import anchored_lines
 from taichi_edges.edges.refinement import refine_wireframe
+from taichi_edges.edges.straight_runs import LEAST_LENGTH_PX, runs_of, straight_runs
 from taichi_edges.kernels.edgel_matching import EdgelMatching
 from taichi_edges.scene import RefineConfig
 from taichi_edges.shapes import Line

@@ -3,11 +3,17 @@
 import numpy as np
 import pytest
 
-from taichi_edges.detectors.chains import SURE_PX, chain_labels, chain_lengths, with_long_chains
+from taichi_edges.detectors.chains import SURE_PX, chain_labels, chain_lengths, with_chain_strengths
 from taichi_edges.edgels import Edgels
 
 SIZE = 200
 NOISE_PX = 0.1  # across; a step to the side that would end a chain is five times what two such edgels differ by
+
+
+def kept_of(edgels, least):
+    """The Edgels on chains of at least `least`, with their chain's say."""
+    found, lengths = with_chain_strengths(edgels, SIZE, SIZE)
+    return found.keep(lengths >= least)
 
 
 def run_of(start, angle, count, noise=0.0, generator=None):
@@ -90,7 +96,7 @@ def test_long_chains_are_kept_in_order_and_are_surer(taichi, generator):
     shuffled = generator.permutation(len(points))
     first = points[shuffled], normals[shuffled], strengths[shuffled]
     edgels = Edgels.of_views([first, NOTHING, view_of(short), view_of(long, strength=0.6)])
-    found = with_long_chains(edgels, 12, SIZE, SIZE)
+    found = kept_of(edgels, 12)
     chosen = np.concatenate([shuffled < 60, np.zeros(8, bool), np.ones(60, bool)])
     np.testing.assert_array_equal(found.points, edgels.points[chosen])
     assert found.starts.tolist() == [0, 60, 60, 60, 120]
@@ -103,12 +109,12 @@ def test_long_chains_are_kept_in_order_and_are_surer(taichi, generator):
 
 def test_edgels_of_short_chains_are_no_less_sure_than_they_were(taichi):
     edgels = Edgels.of_views([view_of(run_of([20, 20], 0, 3), strength=0.4)])
-    np.testing.assert_allclose(with_long_chains(edgels, 0, SIZE, SIZE).strengths, 0.4, rtol=1e-6)
+    np.testing.assert_allclose(kept_of(edgels, 0).strengths, 0.4, rtol=1e-6)
 
 
 def test_nothing_is_left_of_nothing_and_of_texture(taichi):
     for views in ([NOTHING], [NOTHING, view_of(run_of([20, 20], 0, 5))]):
-        found = with_long_chains(Edgels.of_views(views), 12, SIZE, SIZE)
+        found = kept_of(Edgels.of_views(views), 12)
         assert len(found) == 0 and found.view_count == len(views)
 
 
@@ -119,6 +125,6 @@ def test_chains_are_the_same_whichever_threads_and_run(start_taichi, generator):
     edgels, found = Edgels.of_views([view_of(*runs), view_of(*runs[:5])]), []
     for threads in (2, 2, 1):
         start_taichi("f32", threads)
-        kept = with_long_chains(edgels, 12, SIZE, SIZE)
+        kept = kept_of(edgels, 12)
         found.append(kept.points.tobytes() + kept.normals.tobytes() + kept.strengths.tobytes())
     assert found[0] and found[0] == found[1] == found[2]

@@ -8,14 +8,14 @@ import numpy as np
 import pycolmap
 import pytest
 from colmap_projects import LENSES, SIZE, camera, picture_of, write_model
+from told import Told
 
-from taichi_edges import stages
+from taichi_edges import preparing, stages
 from taichi_edges.cameras import invert_pose
 from taichi_edges.edge_set import read_edges
 from taichi_edges.errors import UserError
 from taichi_edges.photogrammetry import Lens, undistorted
 from taichi_edges.pipeline import Run, run_stages
-from taichi_edges.progress import Progress
 from taichi_edges.readers.colmap import read_colmap
 from taichi_edges.readers.scene_box import scene_box
 from taichi_edges.scene_file import check_scene, load_scene
@@ -25,19 +25,6 @@ from taichi_edges.synthetic.visibility import ray_scene
 from taichi_edges.views import read_views
 
 VIEWS = 6
-
-
-class Told(Progress):
-    """Keeps what was said."""
-
-    def __init__(self):
-        self.notes, self.warnings = [], []
-
-    def say(self, text):
-        self.notes.append(text)
-
-    def warn(self, text):
-        self.warnings.append(text)
 
 
 def scene(folder, source=None, **sections):
@@ -107,7 +94,7 @@ def test_panoramas_are_refused_before_anything_else(project, tmp_path):
     folder = project(cameras=[camera("EQUIRECTANGULAR", size=(640, 320), params=(640, 320))] * VIEWS)
     (tmp_path / "run").mkdir()
     with pytest.raises(UserError, match="panorama"):
-        stages.prepare(Run(scene(folder), tmp_path / "run"))
+        preparing.prepare(Run(scene(folder), tmp_path / "run"))
 
 
 def test_of_several_models_the_largest_is_taken_and_it_is_said(project):
@@ -191,11 +178,11 @@ def test_a_model_without_points_needs_a_box_from_the_scene(tmp_path, poses):
         cv2.imwrite(str(tmp_path / "images" / name), picture)
     (tmp_path / "run").mkdir()
     with pytest.raises(UserError, match="images.bin: the model has no points to tell where the scene is; set box"):
-        stages.prepare(Run(scene(tmp_path), tmp_path / "run"))
+        preparing.prepare(Run(scene(tmp_path), tmp_path / "run"))
     with pytest.raises(UserError, match="train.seeds is 'points', but the model has none"):
         box = [[0, 0, 0], [1, 1, 1]]
-        stages.prepare(Run(scene(tmp_path, box=box, train={"seeds": "points"}), tmp_path / "run"))
-    facts = stages.prepare(Run(scene(tmp_path, box=[[0, 0, 0], [1, 1, 1]]), tmp_path / "run"))
+        preparing.prepare(Run(scene(tmp_path, box=box, train={"seeds": "points"}), tmp_path / "run"))
+    facts = preparing.prepare(Run(scene(tmp_path, box=[[0, 0, 0], [1, 1, 1]]), tmp_path / "run"))
     assert facts["box_from"] == "scene" and "seeds.ply" not in facts["files"]
 
 
@@ -288,7 +275,7 @@ def test_views_that_look_away_from_a_box_nobody_has_set_are_left_out(tmp_path, g
         cv2.imwrite(str(tmp_path / "images" / name), picture)
     (tmp_path / "run").mkdir()
     told = Told()
-    facts = stages.prepare(Run(scene(tmp_path, {"max_point_error": 1e9}), tmp_path / "run", progress=told))
+    facts = preparing.prepare(Run(scene(tmp_path, {"max_point_error": 1e9}), tmp_path / "run", progress=told))
     assert facts["views"] == 5 and facts["box_from"] == "reader"
     assert any("1 of 6 views see nothing of the scene box, left out: 5" in text for text in told.warnings)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from taichi_edges import stages
+from taichi_edges import preparing, stages
 from taichi_edges.detectors.ridges import trace_ridges
 from taichi_edges.edgels import Edgels
 from taichi_edges.errors import UserError
@@ -102,7 +102,7 @@ def test_what_is_held_out_is_corrected_for_biases_found_elsewhere(tmp_path):
     def prepared(name, calibration):
         scene = {"source": source, "calibration": calibration}
         run = Run(check_scene(scene, "the test"), tmp_path / name, threads=2)
-        facts = stages.prepare(run)
+        facts = preparing.prepare(run)
         return facts, read_views(run.path("views.npz")), read_views(run.path("held_out.npz"))
 
     facts, *plain = prepared("plain", "off")

@@ -10,7 +10,7 @@ from colmap_projects import camera, picture_of_polygon, write_model
 from test_onnx import grey_kernel, node, write_network
 from test_prepare import SIDES
 
-from taichi_edges import stages
+from taichi_edges import preparing
 from taichi_edges.detectors.masks import EMPTY_RIM_PX, RIM_PX, kept_area, within_masks
 from taichi_edges.edgels import Edgels
 from taichi_edges.errors import UserError
@@ -157,7 +157,7 @@ def test_every_detector_heeds_the_masks(project, tmp_path, source):
         },
         Path("t.yaml"),
     )
-    facts = stages.prepare(Run(config, tmp_path / "run", data_root=tmp_path, threads=2))
+    facts = preparing.prepare(Run(config, tmp_path / "run", data_root=tmp_path, threads=2))
     views = read_views(tmp_path / "run" / "views.npz")
     assert facts["masked_edgels"] > 100
     for view in range(3):

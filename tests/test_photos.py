@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from told import Told
 
-from taichi_edges import photogrammetry, stages
+from taichi_edges import photogrammetry, preparing, stages
 from taichi_edges.cameras import invert_pose
 from taichi_edges.errors import UserError
 from taichi_edges.photogrammetry import image_pairs
 from taichi_edges.pipeline import Run
-from taichi_edges.progress import Progress
 from taichi_edges.readers import photos
 from taichi_edges.readers.images import read_grey
 from taichi_edges.readers.photos import posed_photos, read_photos
@@ -26,19 +26,6 @@ from taichi_edges.synthetic.rendering import look_at
 
 SIZE, FOCAL = (320, 240), 330.0
 VIEWS = 6
-
-
-class Told(Progress):
-    """Keeps what was said."""
-
-    def __init__(self):
-        self.notes, self.warnings = [], []
-
-    def say(self, text):
-        self.notes.append(text)
-
-    def warn(self, text):
-        self.warnings.append(text)
 
 
 def texture(generator, side=512):
@@ -143,11 +130,11 @@ def test_edges_are_prepared_from_photographs_alone(album, solved, tmp_path):
     scene = {"name": "album", "source": {"reader": "images", "path": str(album[0])}}
     told = Told()
     run = Run(check_scene(scene, Path("album.yaml")), tmp_path / "run", threads=2, progress=told)
-    facts = stages.prepare(run)
+    facts = preparing.prepare(run)
     assert facts["views"] + len(facts["held_out"]) == VIEWS and facts["box_from"] == "reader" and facts["edgels"] > 1000
     assert "seeds.ply" in facts["files"] and (run.folder / "undistorted" / "images" / "photo 0.png").is_file()
     assert any(
-        str(path).endswith("thumb.png") for path in stages.source_files(run)
+        str(path).endswith("thumb.png") for path in preparing.source_files(run)
     )  # it may register when others change
 
 
@@ -284,7 +271,7 @@ def test_maps_for_a_scan_are_found_where_photographs_have_no_poses(album, solved
     evaluation = {"kind": "scan", "truth": "scan.ply", "scan": {"edges": "maps"}}
     scene = {"name": "album", "source": source, "evaluation": evaluation}
     run = Run(check_scene(scene, Path("album.yaml")), tmp_path / "run", threads=2, progress=Told())
-    frames = stages._posed_frames(run, stages._listed_frames(run))
+    frames = preparing.posed_frames(run, preparing.listed_frames(run))
     names = frames.names[1:]  # prepare has left one out
     size = photogrammetry.undistorted(frames.lenses[0])[1]
     views = SimpleNamespace(names=names[:-1], edge_maps=np.zeros((1, *size[::-1]), np.uint8))

@@ -82,7 +82,7 @@ KILLER = """
 import os, signal, sys
 sys.path.insert(0, {root!r})
 import run
-from taichi_edges import artefacts, stages
+from taichi_edges import artefacts, preparing, stages
 
 def die(*arguments, **options):
     os.kill(os.getpid(), signal.SIGKILL)
@@ -100,7 +100,7 @@ sys.exit(run.main({arguments!r}))
 """
 KILLED_IN = {
     # after the pictures, while views.npz is being written
-    "prepare": "stages.write_views = write_half",
+    "prepare": "preparing.write_views = write_half",
     # after a whole training, when gaussians.ply is half written
     "train": "from taichi_edges.exporters import splats; splats.write_gaussians = write_half",
     # between points.ply and clusters.npz

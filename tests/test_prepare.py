@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_onnx import grey_kernel, node, write_network
 
-from taichi_edges import stages
+from taichi_edges import preparing
 from taichi_edges.cameras import invert_pose
 from taichi_edges.errors import UserError
 from taichi_edges.pipeline import Run
@@ -68,7 +68,7 @@ def prepare(tmp_path, folder):
         config = check_scene({"name": "test", "source": source, **scene}, Path("test.yaml"))
         (tmp_path / "run").mkdir(exist_ok=True)
         run = Run(config, tmp_path / "run", threads=2, progress=Warnings())
-        facts = stages.prepare(run)
+        facts = preparing.prepare(run)
         return facts, read_views(run.path("views.npz")), run.progress.texts
 
     return run_prepare
@@ -196,7 +196,7 @@ def test_a_network_from_a_file(prepare, tmp_path):
 def test_a_synthetic_scene_can_be_traced_in_its_own_pictures(tmp_path):
     source = {"reader": "synthetic", "part": "block", "views": 4, "size": 120, "detector": "subpixel"}
     run = Run(check_scene({"name": "test", "source": source}, Path("x.yaml")), tmp_path, threads=1)
-    facts = stages.prepare(run)
+    facts = preparing.prepare(run)
     assert facts["part"] == "block" and "line_width_px" not in facts and facts["edgels"] > 200
     assert (tmp_path / "truth.json").is_file()
 

@@ -28,26 +28,34 @@ def _chains_of(points, normals):
     """Number of chains in one view, and (n,) the chain of each edgel. points: (n, 2) px. normals: (n, 2)."""
     if not len(points):
         return 0, np.zeros(0, np.int64)
-    pairs = cKDTree(points).query_pairs(LINK_PX, output_type="ndarray")
-    one, other = pairs.T
-    aligned = np.abs((normals[one] * normals[other]).sum(axis=1)) >= LINK_COSINE
-    apart = points[other] - points[one]
-    beside = np.minimum(np.abs((apart * normals[one]).sum(axis=1)), np.abs((apart * normals[other]).sum(axis=1)))
-    linked = aligned & (beside <= BESIDE_PX)
-    graph = coo_matrix((np.ones(linked.sum(), bool), (one[linked], other[linked])), (len(points), len(points)))
-    return connected_components(graph, directed=False)
+    one, other, cosines, beside = links_between(points, normals, LINK_PX)
+    linked = (cosines >= LINK_COSINE) & (beside.min(axis=0) <= BESIDE_PX)
+    labels = components(len(points), one[linked], other[linked])
+    return labels.max() + 1, labels
+
+
+def links_between(points, normals, reach):
+    """Pairs of edgels of one view that may follow each other: first and second (k,), absolute cosines (k,) between
+    their normals, and (2, k) px by which each is off the line through the other one.
+
+    points, normals: (n, 2) px. reach: px, between them at most.
+    """
+    first, second = cKDTree(points).query_pairs(reach, output_type="ndarray").T
+    cosines = np.abs((normals[first] * normals[second]).sum(axis=1))
+    way = points[second] - points[first]
+    return first, second, cosines, np.abs([(way * normals[end]).sum(axis=1) for end in (first, second)])
+
+
+def components(count, first, second):
+    """(count,) labels, 0 .. n - 1, of the connected components of a graph with edges from `first` to `second`."""
+    graph = coo_matrix((np.ones(len(first), bool), (first, second)), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
 
 
 def chain_lengths(edgels):
     """(e,) number of edgels on the chain of each edgel: its length in pixels, roughly."""
     labels = chain_labels(edgels)
     return np.bincount(labels)[labels] if len(labels) else np.zeros(0, np.int64)
-
-
-def with_long_chains(edgels, least, height, width):
-    """The Edgels on chains of at least `least` edgels, as `with_chain_strengths` makes them."""
-    edgels, lengths = with_chain_strengths(edgels, height, width)
-    return edgels.keep(lengths >= least)
 
 
 def with_chain_strengths(edgels, height, width):

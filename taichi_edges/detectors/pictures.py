@@ -16,10 +16,8 @@ import cv2
 import numpy as np
 
 from taichi_edges.errors import UserError
+from taichi_edges.light import SRGB_LINEAR, SRGB_OFFSET, SRGB_POWER, SRGB_SLOPE, light_of_srgb, srgb_of_light
 from taichi_edges.readers.frames import is_whole
-
-# sRGB (IEC 61966-2-1): values up to SRGB_LINEAR are SRGB_SLOPE times the light, those above a power of it.
-SRGB_LINEAR, SRGB_SLOPE, SRGB_OFFSET, SRGB_POWER = 0.04045, 12.92, 0.055, 2.4
 
 
 @dataclass(frozen=True)
@@ -33,13 +31,6 @@ class Picture:
     light: np.ndarray
     coverage: np.ndarray | None = None
     exponent: float | None = None
-
-
-def light_of_srgb(values):
-    """Linear light, float32, of sRGB-encoded values in 0..1."""
-    values = np.asarray(values, np.float32)
-    power = ((values + SRGB_OFFSET) / (1 + SRGB_OFFSET)) ** SRGB_POWER
-    return np.where(values <= SRGB_LINEAR, values / SRGB_SLOPE, power).astype(np.float32)
 
 
 def levels_per_light(light, exponent=None):
@@ -94,13 +85,6 @@ def read_picture(path, exponent=None):
     if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
         raise UserError(f"{path}: pixels of type {image.dtype}; export it with 8 or 16 bits a channel")
     return as_picture(image, exponent)
-
-
-def srgb_of_light(light):
-    """sRGB-encoded values, float32 0..1, of linear light."""
-    light = np.clip(np.asarray(light, np.float32), 0.0, 1.0)
-    power = (1 + SRGB_OFFSET) * light ** (1 / SRGB_POWER) - SRGB_OFFSET
-    return np.where(light <= SRGB_LINEAR / SRGB_SLOPE, light * SRGB_SLOPE, power).astype(np.float32)
 
 
 def read_colour(path):

@@ -91,7 +91,7 @@ def refined_points(points, directions, views, config, edge_threshold, generator)
     if config.grow:
         least = np.full(len(refined), config.grow)
         least[sizes[2] :] = np.minimum(config.grow, RARE * refined.support[sizes[2] :])  # what was harvested is rare
-        refined = grow_points(matching, refined, least, config.grow_step)
+        refined = grow_points(matching, refined, least)
     supported, steady, explained = judge(matching, refined, config)
     sizes += [len(refined), supported.sum(), steady.sum()]
     weak, unsteady, harvested, grown, weak_later, unsteady_later = np.abs(np.diff(sizes)).tolist()

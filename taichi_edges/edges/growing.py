@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from taichi_edges.viewing_planes import refine_points
 
+STEP_PX = 1.0  # of a step along the tangent
 RADII_PX = (1.5, 1.0, 1.0)  # of the refinement of a step
 COVERED, TOO_CLOSE = 0.6, 0.5  # steps; no proposal is made, and no point kept, so near to one that is there
 STRAYED = 0.7  # steps; a point that the refinement moves farther has jumped to something else
@@ -15,13 +16,12 @@ LEAST_COSINE = 0.8  # between the directions before and after a step
 MOST_ROUNDS = 200
 
 
-def grow_points(matching, refined, least, step_px=1.0):
+def grow_points(matching, refined, least):
     """RefinedPoints and the points that continue them, each the step after another.
 
     matching: EdgelMatching. least: (n,) share of the views that the points which continue each of them need.
-    step_px: of a step.
     """
-    step, newest = step_px * matching.pixel, refined
+    step, newest = STEP_PX * matching.pixel, refined
     for _ in range(MOST_ROUNDS):
         if len(newest) == 0:
             break

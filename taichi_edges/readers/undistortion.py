@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 
 from taichi_edges.artefacts import digest, digest_file, replacing, write_json
-from taichi_edges.detectors.pictures import light_of_srgb, srgb_of_light
 from taichi_edges.errors import UserError
+from taichi_edges.light import light_of_srgb, srgb_of_light
 from taichi_edges.photogrammetry import Lens, colmap_version, distorted_pixels, undistorted
 from taichi_edges.progress import Progress
 from taichi_edges.readers.frames import LEAVE_OUT, is_usable, refuse_views
