@@ -44,7 +44,7 @@ def main(arguments=None):
     from taichi_edges.errors import UserError
 
     try:
-        from taichi_edges.command import run_command
+        from taichi_edges.corridor.command import run_command
 
         run_command(options)
         sys.stdout.flush()

@@ -18,11 +18,11 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from taichi_edges.bezier import evaluate_bezier
-from taichi_edges.cameras import OPENGL_TO_OPENCV, inside_image, invert_pose, project
 from taichi_edges.detectors.ridges import ridge_points
 from taichi_edges.detectors.subpixel import trace_pictures
+from taichi_edges.geometry.bezier import evaluate_bezier
 from taichi_edges.synthetic.visibility import sample_segments
+from taichi_edges.views.cameras import OPENGL_TO_OPENCV, inside_image, invert_pose, project
 
 SPACING = 0.002  # scene units between samples of an edge; about half a pixel
 HIDDEN = 0.004  # scene units; a surface so much in front of a sample hides it

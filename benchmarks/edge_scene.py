@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from taichi_edges.cameras import project
 from taichi_edges.splatting.gaussians import start_gaussians
 from taichi_edges.synthetic.rendering import pixel_size, ring_cameras
+from taichi_edges.views.cameras import project
 
 CURVES = 18  # half of them arcs, 4.5 units long in all: some 4500 edge pixels in a view of 800 x 800
 LENGTHS = (0.15, 0.35)  # unit-cube units

@@ -20,10 +20,10 @@ if not __package__:  # run as a script: the project's root takes the place of th
 
 from benchmarks.machine import available_threads, benchmark_cache, compiled_kernels, machine_line, maxrss_mib
 from benchmarks.markdown import table
-from taichi_edges.command import with_reader
+from taichi_edges.corridor.command import with_reader
+from taichi_edges.corridor.pipeline import STAGES, Run
 from taichi_edges.errors import UserError
-from taichi_edges.pipeline import STAGES, Run
-from taichi_edges.scene_file import load_scene
+from taichi_edges.scene.scene_file import load_scene
 
 ROOT = Path(__file__).resolve().parent.parent
 METRICS = {

@@ -19,13 +19,13 @@ if not __package__:  # run as a script: the project's root takes the place of th
 from benchmarks.machine import available_threads, benchmark_cache, machine_line, peak_memory_mib, reset_peak_memory
 from benchmarks.markdown import table
 from benchmarks.scaling import slope_text
-from taichi_edges.edgels import Edgels
-from taichi_edges.edges.assembly import assemble, fit_assembly
-from taichi_edges.edges.refinement import refine_wireframe
+from taichi_edges.geometry.shapes import EllipticArc, Line
 from taichi_edges.kernels.device import start_taichi
-from taichi_edges.scene import ClusterConfig, FitConfig, RefineConfig
-from taichi_edges.shapes import EllipticArc, Line
-from taichi_edges.views import Views
+from taichi_edges.refinement.stage import refine_wireframe
+from taichi_edges.scene.settings import ClusterConfig, FitConfig, RefineConfig
+from taichi_edges.strokes.assembly import assemble, fit_assembly
+from taichi_edges.views.edgels import Edgels
+from taichi_edges.views.views import Views
 
 WIDTH, FRAME, DEEP = 0.1, 0.02, 0.03  # unit-cube units: of a bay, the wall about its window, and how far that is set in
 PIXEL, DEPTH, FOCAL = 5e-4, 2.0, 4000.0  # unit-cube units; distance of the views; px: DEPTH / FOCAL is a pixel

@@ -22,21 +22,21 @@ if not __package__:  # run as a script: the project's root takes the place of th
 from benchmarks.machine import available_threads, benchmark_cache, machine_line
 from benchmarks.markdown import table
 from benchmarks.pipeline import ROOT, missing_data
-from taichi_edges import stages
-from taichi_edges.edges.assembly import ARC_NUMBERS, assemble, fit_assembly
-from taichi_edges.edges.clustering import grow_clusters
-from taichi_edges.edges.completion import completed
-from taichi_edges.edges.continuation import continued
-from taichi_edges.edges.evidence import support_along
-from taichi_edges.edges.junctions import connected
-from taichi_edges.edges.refinement import refine_wireframe, whole_edges, yardstick_of
-from taichi_edges.kernels.edgel_matching import EdgelMatching
-from taichi_edges.pipeline import Run, run_stages
-from taichi_edges.scene_file import load_scene
+from taichi_edges.corridor import cluster, evaluate, fit
+from taichi_edges.corridor.pipeline import Run, run_stages
+from taichi_edges.evidence.edge_support import support_along
+from taichi_edges.evidence.edgel_matching import EdgelMatching
+from taichi_edges.evidence.viewing_planes import refine_points
+from taichi_edges.geometry.wireframe import Wireframe, read_wireframe, write_wireframe
+from taichi_edges.refinement.completion import completed
+from taichi_edges.refinement.continuation import continued
+from taichi_edges.refinement.junctions import connected
+from taichi_edges.refinement.stage import refine_wireframe, whole_edges, yardstick_of
+from taichi_edges.scene.scene_file import load_scene
+from taichi_edges.strokes.assembly import ARC_NUMBERS, assemble, fit_assembly
+from taichi_edges.strokes.clustering import grow_clusters
 from taichi_edges.synthetic.hard_parts import HARD_PARTS
-from taichi_edges.viewing_planes import refine_points
-from taichi_edges.views import read_views
-from taichi_edges.wireframe import Wireframe, read_wireframe, write_wireframe
+from taichi_edges.views.views import read_views
 
 SCENES = ("abc_00004926_images", "abc_00000006_images", "cad_plate", "demo")
 DETECTORS = {"images": "subpixel", "maps": "auto"}  # of a synthetic part: our own on its pictures, or its drawn maps
@@ -60,7 +60,7 @@ WORST = {"exact p95 mm": ("exact_p95_mm", "{:.2f}")}
 
 def trained_points(run):
     """Points (n, 3) and directions (n, 3): the trained centres that pass the paper's filters, in the unit cube."""
-    stages.cluster(with_filter(run, refine=False))
+    cluster.cluster(with_filter(run, refine=False))
     with np.load(run.path("clusters.npz")) as archive:
         return archive["points"], archive["directions"]
 
@@ -99,8 +99,8 @@ def fitted(run, points, directions):
 
 def filtered(run, **settings):
     """The edges of the stages `cluster` and `fit` with some settings of the scene's `filter` section."""
-    stages.cluster(with_filter(run, **settings))
-    stages.fit(run)
+    cluster.cluster(with_filter(run, **settings))
+    fit.fit(run)
     views = read_views(run.path("views.npz"))
     return read_wireframe(run.path("edges_fit.json"))[0].transformed(views.similarity.to_unit, views.similarity.scale)
 
@@ -201,7 +201,7 @@ def evaluated(run, wireframe, views):
     write_wireframe(
         run.path("edges.json"), wireframe.transformed(similarity.to_input, 1.0 / similarity.scale), {"frame": "input"}
     )
-    return stages.evaluate(run)
+    return evaluate.evaluate(run)
 
 
 def trained(run):
@@ -219,7 +219,7 @@ def with_kernels(run):
 def measure_part(run):
     """Measured of the stages after the training, which are run anew."""
     _, seconds = timed(run_stages, run, "cluster", "refine")
-    return Measured(stages.evaluate(run), seconds)
+    return Measured(evaluate.evaluate(run), seconds)
 
 
 def cells(measured, columns):

@@ -16,8 +16,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from taichi_edges.exporters.overlays import background, draw_edges
 from taichi_edges.exporters.palette import label_colours
-from taichi_edges.views import read_views
-from taichi_edges.wireframe import read_wireframe
+from taichi_edges.geometry.wireframe import read_wireframe
+from taichi_edges.views.views import read_views
 
 PANEL, WIDE_PANEL = 420, 760  # px
 MARGIN = 0.08  # of the panel, around the edges

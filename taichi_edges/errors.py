@@ -25,3 +25,8 @@ def name_some(names, most=5):
     names = [str(name) for name in names]
     rest = len(names) - most
     return ", ".join(names) if rest <= 0 else f"{', '.join(names[:most])} and {rest} more"
+
+
+def amount(count, noun, plural=None):
+    """'1 line', '2 lines', '3 more boxes'."""
+    return f"{count} {noun if count == 1 else plural or noun + 's'}"

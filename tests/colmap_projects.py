@@ -4,10 +4,10 @@ import cv2
 import numpy as np  # before pycolmap: see photogrammetry
 import pycolmap
 
-from taichi_edges.cameras import invert_pose
-from taichi_edges.light import light_of_srgb, srgb_of_light
 from taichi_edges.synthetic.rendering import interpolated_normals, shade
 from taichi_edges.synthetic.visibility import ray_scene
+from taichi_edges.views.cameras import invert_pose
+from taichi_edges.views.light import light_of_srgb, srgb_of_light
 
 # (fx, fy, cx, cy and what the model adds) of every model that a pinhole camera can show, for pictures of 320 x 240 px.
 LENSES = {

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from taichi_edges.edgels import Edgels
 from taichi_edges.synthetic.rendering import ring_cameras
-from taichi_edges.views import Views, pixel_size
+from taichi_edges.views.edgels import Edgels
+from taichi_edges.views.views import Views, pixel_size
 
 SIZE, VIEWS = 400, 24
 STEP = 1e-4  # unit-cube units, over which tangents are differences

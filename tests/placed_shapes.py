@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from taichi_edges.shapes import EllipticArc, Line, Spline
+from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
 
 PLANE = np.array([[1.0, 0, 0], [0, 1.0, 0]])
 KINDS = ("line", "arc", "long_arc", "circle", "elliptic_arc", "long_elliptic_arc", "ellipse", "spline", "loop")

@@ -11,9 +11,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from taichi_edges.edgels import Edgels
 from taichi_edges.splatting.gaussians import Gaussians
 from taichi_edges.synthetic.rendering import look_at
+from taichi_edges.views.edgels import Edgels
 
 PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits")
 

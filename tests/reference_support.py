@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from taichi_edges.cameras import inside_image
-from taichi_edges.support import CLAIM, OWNER_ROUNDS, SAME_EDGE, line_width
+from taichi_edges.evidence.support import CLAIM, OWNER_ROUNDS, SAME_EDGE, line_width
+from taichi_edges.views.cameras import inside_image
 
 
 def edge_strength(views, points):

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from edgel_scenes import line, views_of
 
-from taichi_edges.edges.adjustment import Constraint, adjusted, with_vertices
-from taichi_edges.edges.charts import derivatives, moved, nearest_parameters, neighbors, own_unknowns
-from taichi_edges.kernels.edgel_matching import EdgelMatching
-from taichi_edges.shapes import EllipticArc, Line, Spline
-from taichi_edges.wireframe import Edge, Wireframe
+from taichi_edges.evidence.edgel_matching import EdgelMatching
+from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
+from taichi_edges.geometry.wireframe import Edge, Wireframe
+from taichi_edges.refinement.adjustment import Constraint, adjusted, with_vertices
+from taichi_edges.refinement.charts import derivatives, moved, nearest_parameters, neighbors, own_unknowns
 
 CORNERS = np.array([[0.3, 0.3, 0.3], [0.7, 0.32, 0.3], [0.32, 0.7, 0.35], [0.28, 0.3, 0.75]])
 TILT = np.array([[0.8, 0.6, 0.0], [-0.36, 0.48, 0.8]])  # orthogonal unit vectors

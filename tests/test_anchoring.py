@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from edgel_scenes import SIZE, blank_views, line, pixel_of, views_of
 
-from taichi_edges.edgels import Edgels
-from taichi_edges.edges.anchoring import anchored_lines
-from taichi_edges.edges.refinement import refine_wireframe
-from taichi_edges.edges.straight_runs import LEAST_LENGTH_PX, runs_of, straight_runs
-from taichi_edges.kernels.edgel_matching import EdgelMatching
-from taichi_edges.scene import RefineConfig
-from taichi_edges.shapes import Line
-from taichi_edges.wireframe import Wireframe
+from taichi_edges.evidence.edgel_matching import EdgelMatching
+from taichi_edges.geometry.shapes import Line
+from taichi_edges.geometry.wireframe import Wireframe
+from taichi_edges.refinement.anchoring import anchored_lines
+from taichi_edges.refinement.stage import refine_wireframe
+from taichi_edges.refinement.straight_runs import LEAST_LENGTH_PX, runs_of, straight_runs
+from taichi_edges.scene.settings import RefineConfig
+from taichi_edges.views.edgels import Edgels
 
 VIEWS, FOCAL, DISTANCE = 9, 400.0, 1.1
 WALL = 0.6  # z of the façade, which spans x and y

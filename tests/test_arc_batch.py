@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from taichi_edges.edges.arc_batch import ArcBatch, fit_batch
-from taichi_edges.edges.arc_growth import Cloud, Scale, all_unbroken, unbroken
-from taichi_edges.edges.arcs import Arc, fit_arc
-from taichi_edges.edges.continuation import Places
-from taichi_edges.edges.merging import EndGrid, Piece
-from taichi_edges.edges.model_selection import distances_to, track_of
-from taichi_edges.shapes import EllipticArc, Line
+from taichi_edges.fitting.arc_batch import ArcBatch, fit_batch
+from taichi_edges.fitting.arcs import Arc, fit_arc
+from taichi_edges.fitting.distances import distances_to
+from taichi_edges.fitting.model_selection import track_of
+from taichi_edges.geometry.shapes import EllipticArc, Line
+from taichi_edges.refinement.continuation import Places
+from taichi_edges.strokes.arc_growth import Cloud, Scale, all_unbroken, unbroken
+from taichi_edges.strokes.merging import EndGrid, Piece
 
 ROUNDING = 1e-9  # of lengths of about 1, after sums in another order
 

@@ -19,10 +19,10 @@ from benchmarks.scaling import slopes
 from benchmarks.view_step import PARTS, DumpedStep, part_of
 from benchmarks.wireframe import STEP_COLUMNS, STEPS, cells, measure_part, scene_path
 from benchmarks.wireframe import main as ablate
-from taichi_edges.cameras import project
-from taichi_edges.pipeline import Run
-from taichi_edges.scene_file import load_scene
+from taichi_edges.corridor.pipeline import Run
+from taichi_edges.scene.scene_file import load_scene
 from taichi_edges.splatting.gaussians import Gaussians
+from taichi_edges.views.cameras import project
 
 ROOT = Path(__file__).parent.parent
 SCENE = """

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from taichi_edges.edges import segmentation
-from taichi_edges.edges.branches import separate_branches
-from taichi_edges.edges.segmentation import (
+from taichi_edges.strokes import segmentation
+from taichi_edges.strokes.branches import separate_branches
+from taichi_edges.strokes.segmentation import (
     CURVE_PRICE,
     LINE_PRICE,
     MIN_NOISE,

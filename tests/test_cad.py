@@ -11,15 +11,15 @@ import pytest
 from part21 import read_step
 from scipy.interpolate import BSpline
 
-from taichi_edges.bezier import evaluate_bezier
-from taichi_edges.edge_set import write_edges
 from taichi_edges.exporters.dxf import APPLICATION, layer_of, write_dxf
 from taichi_edges.exporters.nurbs import joined
 from taichi_edges.exporters.palette import KIND_COLOURS
 from taichi_edges.exporters.step import connected_parts, encoded, prefix_for, write_step
-from taichi_edges.shapes import EllipticArc, Line, Spline
+from taichi_edges.geometry.bezier import evaluate_bezier
+from taichi_edges.geometry.edge_set import write_edges
+from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
+from taichi_edges.geometry.wireframe import Edge, Evidence, Wireframe, read_wireframe, write_wireframe
 from taichi_edges.synthetic.parts import PARTS
-from taichi_edges.wireframe import Edge, Evidence, Wireframe, read_wireframe, write_wireframe
 
 ROOT = Path(__file__).parent.parent
 EXACT = 1e-9  # of the edges' size: sixteen digits go through a few products and, in DXF, through degrees
@@ -209,7 +209,7 @@ def test_the_same_edges_give_the_same_bytes_in_every_process(tmp_path, suffix):
     """Python orders sets of strings by a random number of the process."""
     source = write_wireframe(tmp_path / "edges.json", house(), {})
     code = (
-        "import sys; from taichi_edges.exporters import EXPORTERS; from taichi_edges.wireframe import read_wireframe; "
+        "import sys; from taichi_edges.exporters import EXPORTERS; from taichi_edges.geometry.wireframe import read_wireframe; "
         f"[EXPORTERS[{suffix!r}](path, read_wireframe(sys.argv[1])[0]) for path in sys.argv[2:]]"
     )
     written = set()

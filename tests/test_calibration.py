@@ -8,19 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from taichi_edges.cameras import project
-from taichi_edges.detectors import consensus as consensus_module
-from taichi_edges.detectors.backgrounds import flooded, image_steps, look_beside, sample, smooth_step
-from taichi_edges.detectors.calibration import calibrate, sides_of
-from taichi_edges.detectors.consensus import Consensus, across, edgel_table
-from taichi_edges.detectors.offsets import (
-    Observations,
-    camera_leverage,
-    fit_offsets,
-    neighbourhoods,
-    standard_errors,
-)
-from taichi_edges.detectors.offsets import _solve as solve
+from taichi_edges.calibration import consensus as consensus_module
+from taichi_edges.calibration.backgrounds import flooded, image_steps, look_beside, sample, smooth_step
+from taichi_edges.calibration.calibration import calibrate, sides_of
+from taichi_edges.calibration.consensus import Consensus, across, edgel_table
+from taichi_edges.calibration.offsets import Observations, camera_leverage, fit_offsets, neighbourhoods, standard_errors
+from taichi_edges.calibration.offsets import _solve as solve
 from taichi_edges.detectors.ridges import single_width, trace_ridges
 from taichi_edges.synthetic.drawing import Imperfections, draw_edge_map
 from taichi_edges.synthetic.parts import PARTS
@@ -33,7 +26,8 @@ from taichi_edges.synthetic.rendering import (
     ring_cameras,
 )
 from taichi_edges.synthetic.visibility import ray_scene, sample_contours, sample_edges, visible_from
-from taichi_edges.views import Views
+from taichi_edges.views.cameras import project
+from taichi_edges.views.views import Views
 
 SIZE, VIEWS, FINE = 260, 14, 3  # px, views, rays along each side of a pixel of the alpha channel
 SHIFT, OFFSET = (-0.5, 0.7), 1.2  # px, planted

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from taichi_edges.detectors.chains import SURE_PX, chain_labels, chain_lengths, with_chain_strengths
-from taichi_edges.edgels import Edgels
+from taichi_edges.views.edgels import Edgels
 
 SIZE = 200
 NOISE_PX = 0.1  # across; a step to the side that would end a chain is five times what two such edgels differ by

@@ -10,19 +10,19 @@ import pytest
 from colmap_projects import LENSES, SIZE, camera, picture_of, write_model
 from told import Told
 
-from taichi_edges import preparing, stages
-from taichi_edges.cameras import invert_pose
-from taichi_edges.edge_set import read_edges
+from taichi_edges.corridor import evaluate, prepare, train
+from taichi_edges.corridor.pipeline import Run, run_stages
 from taichi_edges.errors import UserError
-from taichi_edges.photogrammetry import Lens, undistorted
-from taichi_edges.pipeline import Run, run_stages
+from taichi_edges.geometry.edge_set import read_edges
 from taichi_edges.readers.colmap import read_colmap
+from taichi_edges.readers.photogrammetry import Lens, undistorted
 from taichi_edges.readers.scene_box import scene_box
-from taichi_edges.scene_file import check_scene, load_scene
+from taichi_edges.scene.scene_file import check_scene, load_scene
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import look_at, ring_cameras
 from taichi_edges.synthetic.visibility import ray_scene
-from taichi_edges.views import read_views
+from taichi_edges.views.cameras import invert_pose
+from taichi_edges.views.views import read_views
 
 VIEWS = 6
 
@@ -94,7 +94,7 @@ def test_panoramas_are_refused_before_anything_else(project, tmp_path):
     folder = project(cameras=[camera("EQUIRECTANGULAR", size=(640, 320), params=(640, 320))] * VIEWS)
     (tmp_path / "run").mkdir()
     with pytest.raises(UserError, match="panorama"):
-        preparing.prepare(Run(scene(folder), tmp_path / "run"))
+        prepare.prepare(Run(scene(folder), tmp_path / "run"))
 
 
 def test_of_several_models_the_largest_is_taken_and_it_is_said(project):
@@ -178,11 +178,11 @@ def test_a_model_without_points_needs_a_box_from_the_scene(tmp_path, poses):
         cv2.imwrite(str(tmp_path / "images" / name), picture)
     (tmp_path / "run").mkdir()
     with pytest.raises(UserError, match="images.bin: the model has no points to tell where the scene is; set box"):
-        preparing.prepare(Run(scene(tmp_path), tmp_path / "run"))
+        prepare.prepare(Run(scene(tmp_path), tmp_path / "run"))
     with pytest.raises(UserError, match="train.seeds is 'points', but the model has none"):
         box = [[0, 0, 0], [1, 1, 1]]
-        preparing.prepare(Run(scene(tmp_path, box=box, train={"seeds": "points"}), tmp_path / "run"))
-    facts = preparing.prepare(Run(scene(tmp_path, box=[[0, 0, 0], [1, 1, 1]]), tmp_path / "run"))
+        prepare.prepare(Run(scene(tmp_path, box=box, train={"seeds": "points"}), tmp_path / "run"))
+    facts = prepare.prepare(Run(scene(tmp_path, box=[[0, 0, 0], [1, 1, 1]]), tmp_path / "run"))
     assert facts["box_from"] == "scene" and "seeds.ply" not in facts["files"]
 
 
@@ -275,7 +275,7 @@ def test_views_that_look_away_from_a_box_nobody_has_set_are_left_out(tmp_path, g
         cv2.imwrite(str(tmp_path / "images" / name), picture)
     (tmp_path / "run").mkdir()
     told = Told()
-    facts = preparing.prepare(Run(scene(tmp_path, {"max_point_error": 1e9}), tmp_path / "run", progress=told))
+    facts = prepare.prepare(Run(scene(tmp_path, {"max_point_error": 1e9}), tmp_path / "run", progress=told))
     assert facts["views"] == 5 and facts["box_from"] == "reader"
     assert any("1 of 6 views see nothing of the scene box, left out: 5" in text for text in told.warnings)
 
@@ -334,7 +334,7 @@ def test_edges_come_out_in_the_frame_and_scale_of_colmap(part_project, tmp_path)
     assert "seeds.ply" in facts["files"] and any("scene box (" in text for text in told.notes)
     seeds = views.similarity.to_unit(into_colmap(part.edges.sample(0.05)[0]))
     paper = load_scene(tmp_path / "part.yaml", preset="paper", settings=["train.gaussians=500"])
-    started = stages._start(Run(paper, run.folder), views, np.random.default_rng(0)).means
+    started = train.start_of_training(Run(paper, run.folder), views, np.random.default_rng(0)).means
     # The paper starts from the model's points; where there are fewer than it wants, random ones join them.
     assert len(seeds) < 400 and len(started) == 500
     assert np.allclose(np.sort(started[: len(seeds)], axis=0), np.sort(seeds, axis=0), atol=1e-5)
@@ -356,6 +356,6 @@ def test_maps_for_a_scan_go_the_way_of_the_images_that_prepare_has_kept(project,
     size = undistorted(Lens("OPENCV", *SIZE, LENSES["OPENCV"]))[1]
     names = [f"{view:04d}" for view in range(VIEWS - 1)]
     views = SimpleNamespace(names=names[1:], edge_maps=np.zeros((1, *size[::-1]), np.uint8))
-    maps = stages._scan_maps(run, views, SimpleNamespace(names=names[:1]))
+    maps = evaluate._scan_maps(run, views, SimpleNamespace(names=names[:1]))
     assert set(maps) == set(names) and all(each.shape == size[::-1] and each.max() > 200 for each in maps.values())
     assert not (run.path("undistorted_for_scan") / "images").exists()

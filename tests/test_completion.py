@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from edgel_scenes import views_of
 
-from taichi_edges.edges.completion import LONGEST_PX, MOST_PAIRS, clear_places, completed, open_pairs
-from taichi_edges.kernels.edgel_matching import EdgelMatching
-from taichi_edges.shapes import Line
-from taichi_edges.wireframe import Edge, Wireframe
+from taichi_edges.evidence.edgel_matching import EdgelMatching
+from taichi_edges.geometry.shapes import Line
+from taichi_edges.geometry.wireframe import Edge, Wireframe
+from taichi_edges.refinement.completion import LONGEST_PX, MOST_PAIRS, clear_places, completed, open_pairs
 
 NEAR, FAR = np.array([[0.4, 0.4, 0.35], [0.48, 0.42, 0.35]]), np.array([[0.35, 0.7, 0.5], [0.55, 0.75, 0.45]])
 SEEDS = range(2)

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 from placed_shapes import PLANE, Placing, any_shape
 
-from taichi_edges.edges.continuation import (
+from taichi_edges.fitting.distances import distances_to
+from taichi_edges.fitting.model_selection import Yardstick
+from taichi_edges.geometry.shapes import EllipticArc, Line, Spline, polyline
+from taichi_edges.refinement.continuation import (
     Merging,
     continued,
     joints,
@@ -12,8 +15,6 @@ from taichi_edges.edges.continuation import (
     with_whole_circles,
     without_repeats,
 )
-from taichi_edges.edges.model_selection import Yardstick, distances_to
-from taichi_edges.shapes import EllipticArc, Line, Spline, polyline
 
 PIXEL = 0.0025  # unit-cube units: an object as large as an image of 400 pixels
 NOISE = 0.2 * PIXEL

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from edgel_scenes import CylinderContour, arc, centre, line, pixel_of, tangents, views_of
 
-from taichi_edges.edges.assembly import ARC_NUMBERS, Assembly
-from taichi_edges.edges.contours import CONTOUR_SHARE, evidence, steady_edges, without_contours
-from taichi_edges.explaining import explain
-from taichi_edges.kernels.edgel_matching import EdgelMatching
-from taichi_edges.scene import FilterConfig
-from taichi_edges.viewing_planes import refine_points
+from taichi_edges.evidence.edgel_matching import EdgelMatching
+from taichi_edges.evidence.explaining import explain
+from taichi_edges.evidence.viewing_planes import refine_points
+from taichi_edges.scene.settings import FilterConfig
+from taichi_edges.strokes.assembly import ARC_NUMBERS, Assembly
+from taichi_edges.strokes.contours import CONTOUR_SHARE, evidence, steady_edges, without_contours
 
 A = line([0.2, 0.3, 0.3], [0.8, 0.35, 0.4])
 RIM = arc([0.5, 0.5, 0.6], 0.25)

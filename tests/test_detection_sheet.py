@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from taichi_edges.edgels import Edgels
-from taichi_edges.exporters import detection_sheet as sheet
-from taichi_edges.exporters.detection_sheet import (
+from taichi_edges.detectors import detection_sheet as sheet
+from taichi_edges.detectors.detection_sheet import (
     NEGATIVE,
     POSITIVE,
     UNKNOWN,
@@ -17,7 +16,8 @@ from taichi_edges.exporters.detection_sheet import (
     residual_colours,
     write_detection_sheet,
 )
-from taichi_edges.views import Views
+from taichi_edges.views.edgels import Edgels
+from taichi_edges.views.views import Views
 
 
 def make_views(generator, count=3, width=160, height=120, edgels_each=200, image_paths=None):

@@ -3,14 +3,10 @@
 import numpy as np
 import pytest
 
-from taichi_edges.detectors.drawing import DRAWN_SIGMA, PATCH, draw_edge_maps, draw_lines
-from taichi_edges.detectors.ridges import (
-    gaussian_derivatives,
-    ridge_points,
-    trace_ridges,
-)
-from taichi_edges.support import line_width
-from taichi_edges.views import Views
+from taichi_edges.detectors.ridges import gaussian_derivatives, ridge_points, trace_ridges
+from taichi_edges.evidence.support import line_width
+from taichi_edges.views.drawing import DRAWN_SIGMA, PATCH, draw_edge_maps, draw_lines
+from taichi_edges.views.views import Views
 
 SIZE = 120
 

@@ -11,36 +11,17 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from taichi_edges.bezier import (
-    LENGTH_SEGMENTS,
-    bernstein,
-    bezier_lengths,
-    evaluate_bezier,
-)
-from taichi_edges.edge_set import EdgeSet, read_edges, write_edges
-from taichi_edges.edges.clustering import (
-    DIRECTION_MEMORY,
-    UNASSIGNED,
-    alignment,
-    grow_clusters,
-    members_of_clusters,
-    neighbor_graph,
-    seed_order,
-)
-from taichi_edges.edges.filtering import filter_points, statistical_inliers
-from taichi_edges.edges.fitting import (
-    BENDING,
-    fit_cluster,
-    fit_curve,
-    fit_line,
-    lsq_chain,
-    nearest_on_chain,
-    wireframe_of,
-)
-from taichi_edges.edges.ordering import _bridge, connected_graph, order_points
 from taichi_edges.errors import UserError
-from taichi_edges.scene import ClusterConfig, FilterConfig, FitConfig
-from taichi_edges.views import Views
+from taichi_edges.fitting.cubic_chains import BENDING, lsq_chain, nearest_on_chain
+from taichi_edges.geometry.bezier import LENGTH_SEGMENTS, bernstein, bezier_lengths, evaluate_bezier
+from taichi_edges.geometry.edge_set import EdgeSet, read_edges, write_edges
+from taichi_edges.points.filtering import filter_points, statistical_inliers
+from taichi_edges.scene.settings import ClusterConfig, FilterConfig, FitConfig
+from taichi_edges.strokes.cluster_fits import fit_cluster, fit_curve, fit_line, wireframe_of
+from taichi_edges.strokes.clustering import DIRECTION_MEMORY, grow_clusters, seed_order
+from taichi_edges.strokes.neighbors import UNASSIGNED, alignment, members_of_clusters, neighbor_graph
+from taichi_edges.strokes.ordering import _bridge, connected_graph, order_points
+from taichi_edges.views.views import Views
 
 CENTRE = np.full(3, 0.5)
 NOISE = 0.002  # unit-cube units, on every axis: what trained Gaussians scatter about an edge

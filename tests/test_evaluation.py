@@ -11,8 +11,6 @@ import pytest
 from scipy.spatial import cKDTree
 from true_shapes import assert_perfect, circle_pieces, line, truth_as_edges, truth_of
 
-from taichi_edges.bezier import evaluate_bezier
-from taichi_edges.edge_set import EdgeSet, write_edges
 from taichi_edges.errors import UserError
 from taichi_edges.evaluation.ground_truth import GroundTruth, edges_of_list, read_ground_truth, true_parameters
 from taichi_edges.evaluation.metrics import (
@@ -25,6 +23,8 @@ from taichi_edges.evaluation.metrics import (
     sample_prediction,
 )
 from taichi_edges.evaluation.primitives import true_primitives
+from taichi_edges.geometry.bezier import evaluate_bezier
+from taichi_edges.geometry.edge_set import EdgeSet, write_edges
 
 SCENES = {"00000006": "abc_nef/00000006/gt", "00004926": "abc_nef_edge/00004926/gt"}
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from edgel_scenes import CylinderContour, arc, line, pixel_of, views_of
 
-from taichi_edges.edges.evidence import (
+from taichi_edges.evidence.edge_support import (
     Claims,
     Samples,
     claims_of,
@@ -16,8 +16,8 @@ from taichi_edges.edges.evidence import (
     support_of,
     support_share,
 )
-from taichi_edges.kernels.edgel_matching import EdgelMatching
-from taichi_edges.shapes import EllipticArc, Line, Spline
+from taichi_edges.evidence.edgel_matching import EdgelMatching
+from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
 
 START, END = np.array([0.2, 0.3, 0.3]), np.array([0.8, 0.35, 0.4])
 A = line(START, END)

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from taichi_edges.cameras import Similarity
 from taichi_edges.errors import UserError
 from taichi_edges.exporters import EXPORTERS
 from taichi_edges.exporters.line_sets import (
@@ -24,7 +23,6 @@ from taichi_edges.exporters.overlays import (
     IMAGE_FADE,
     background,
     caption,
-    choose_views,
     clip_segments,
     contact_sheet,
     draw_overlays,
@@ -32,11 +30,12 @@ from taichi_edges.exporters.overlays import (
 )
 from taichi_edges.exporters.palette import CLUSTER_COLOURS, CURVE_COLOUR, LINE_COLOUR, UNLABELLED_COLOUR, label_colours
 from taichi_edges.exporters.point_cloud import read_oriented_points, write_oriented_points
-from taichi_edges.exporters.splats import FIELDS, HARMONIC_0, read_gaussians, write_gaussians
 from taichi_edges.exporters.viewer import build_geometries, show
-from taichi_edges.shapes import EllipticArc, Line, Spline, polyline
-from taichi_edges.views import Views
-from taichi_edges.wireframe import Edge, Evidence, Wireframe
+from taichi_edges.files.splats import FIELDS, HARMONIC_0, read_gaussians, write_gaussians
+from taichi_edges.geometry.shapes import EllipticArc, Line, Spline, polyline
+from taichi_edges.geometry.wireframe import Edge, Evidence, Wireframe
+from taichi_edges.views.cameras import Similarity
+from taichi_edges.views.views import Views, choose_views
 
 FOCAL = 100.0  # pixels
 WIDTH, HEIGHT = 160, 120

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from placed_shapes import PLANE, Placing, any_shape
 
-from taichi_edges.edges.extents import AHEAD_PX, LOST_PX, ROUNDS, extended
-from taichi_edges.edges.model_selection import distances_to
-from taichi_edges.shapes import EllipticArc, Line
+from taichi_edges.fitting.distances import distances_to
+from taichi_edges.geometry.shapes import EllipticArc, Line
+from taichi_edges.refinement.extents import AHEAD_PX, LOST_PX, ROUNDS, extended
 
 PIXEL = 0.0025  # unit-cube units
 SEEDS = range(3)

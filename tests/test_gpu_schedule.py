@@ -28,7 +28,7 @@ from scipy.spatial import cKDTree
 from test_gradients import assert_gradients, gradients, random_neighbors
 
 from taichi_edges.progress import Progress
-from taichi_edges.scene import DensityConfig, TrainConfig
+from taichi_edges.scene.settings import DensityConfig, TrainConfig
 from taichi_edges.splatting.gaussians import start_gaussians
 from taichi_edges.splatting.training import Training
 from taichi_edges.synthetic.parts import PARTS

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from taichi_edges.bezier import evaluate_bezier
+from taichi_edges.geometry.bezier import evaluate_bezier
 from taichi_edges.synthetic.free_form import hyperbola_cubics, nut_side
 from taichi_edges.synthetic.hard_parts import HARD_PARTS, PIXEL
 from taichi_edges.synthetic.profiles import CHORD_ERROR

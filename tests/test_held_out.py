@@ -6,28 +6,23 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from taichi_edges import preparing, stages
+from taichi_edges.corridor import evaluate, prepare
+from taichi_edges.corridor.pipeline import Run
 from taichi_edges.detectors.ridges import trace_ridges
-from taichi_edges.edgels import Edgels
 from taichi_edges.errors import UserError
 from taichi_edges.evaluation.dense_curves import middle_samples
 from taichi_edges.evaluation.edgel_index import MOST_SINE, EdgelIndex
-from taichi_edges.evaluation.held_out import (
-    PLACE_PX,
-    Sightings,
-    choose_held_out,
-    held_out_metrics,
-    split_views,
-)
+from taichi_edges.evaluation.held_out import PLACE_PX, Sightings, held_out_metrics
 from taichi_edges.evaluation.metrics import average_per_voxel, exact_polylines, point_metrics
 from taichi_edges.evaluation.projected_curves import Camera, Chords
-from taichi_edges.pipeline import Run
 from taichi_edges.progress import Progress
-from taichi_edges.scene_file import check_scene
+from taichi_edges.scene.scene_file import check_scene
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import Imperfections, render_edge_maps, ring_cameras
 from taichi_edges.synthetic.visibility import Samples, outward_directions, ray_scene, visible_from
-from taichi_edges.views import Views, pixel_size, read_views
+from taichi_edges.views.edgels import Edgels
+from taichi_edges.views.splitting import choose_held_out, split_views
+from taichi_edges.views.views import Views, pixel_size, read_views
 
 SIZE, VIEWS = 540, 30  # at which the 5 mm of the metrics in space are the 1.5 px of those in views
 
@@ -102,7 +97,7 @@ def test_what_is_held_out_is_corrected_for_biases_found_elsewhere(tmp_path):
     def prepared(name, calibration):
         scene = {"source": source, "calibration": calibration}
         run = Run(check_scene(scene, "the test"), tmp_path / name, threads=2)
-        facts = preparing.prepare(run)
+        facts = prepare.prepare(run)
         return facts, read_views(run.path("views.npz")), read_views(run.path("held_out.npz"))
 
     facts, *plain = prepared("plain", "off")
@@ -317,8 +312,8 @@ def test_edges_that_fit_no_better_than_chance_are_told_from_those_that_fit(brack
     exchanged = Edgels.of_views([edgels.of_view((view + 1) % len(held_out)) for view in range(len(held_out))])
     told = Warnings()
     for one in (held_out, replace(held_out, edgels=exchanged)):
-        stages._warn_of_chance(held_out_metrics(exact_polylines(part.edges), views, one), told)
+        evaluate._warn_of_chance(held_out_metrics(exact_polylines(part.edges), views, one), told)
     (text,) = told.texts
     assert "of the edges fit the held-out views, where chance alone gives" in text and "their order" in text
-    stages._warn_of_chance(held_out_metrics(exact_polylines(part.edges), views, split_views(views, [])[1]), told)
+    evaluate._warn_of_chance(held_out_metrics(exact_polylines(part.edges), views, split_views(views, [])[1]), told)
     assert told.texts == [text]  # nothing is known without held-out views

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from taichi_edges.cameras import inside_image, invert_pose, project
 from taichi_edges.errors import UserError
 from taichi_edges.readers.idr import decompose, read_idr
-from taichi_edges.scene import SourceConfig
+from taichi_edges.scene.settings import SourceConfig
+from taichi_edges.views.cameras import inside_image, invert_pose, project
 
 VIEWS, WIDTH, HEIGHT = 4, 40, 30
 RADIUS, CENTRE = 250.0, np.array([-27.0, -44.0, 740.0])  # millimetres, as in DTU

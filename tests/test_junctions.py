@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from placed_shapes import PLANE, Placing, any_shape
 
-from taichi_edges.edges.junctions import MEETING_PX, REACH_PX, connected
-from taichi_edges.edges.model_selection import distances_to
-from taichi_edges.shapes import EllipticArc, Line, Spline
+from taichi_edges.fitting.distances import distances_to
+from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
+from taichi_edges.refinement.junctions import MEETING_PX, REACH_PX, connected
 
 PIXEL = 0.0025  # unit-cube units
 SEEDS = range(4)

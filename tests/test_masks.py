@@ -10,15 +10,15 @@ from colmap_projects import camera, picture_of_polygon, write_model
 from test_onnx import grey_kernel, node, write_network
 from test_prepare import SIDES
 
-from taichi_edges import preparing
+from taichi_edges.corridor import prepare
+from taichi_edges.corridor.pipeline import Run
 from taichi_edges.detectors.masks import EMPTY_RIM_PX, RIM_PX, kept_area, within_masks
-from taichi_edges.edgels import Edgels
 from taichi_edges.errors import UserError
-from taichi_edges.pipeline import Run
 from taichi_edges.progress import Progress
 from taichi_edges.readers.frames import Frames
-from taichi_edges.scene_file import check_scene
-from taichi_edges.views import read_views
+from taichi_edges.scene.scene_file import check_scene
+from taichi_edges.views.edgels import Edgels
+from taichi_edges.views.views import read_views
 
 LEFT = np.array([[-0.4, -0.3], [-0.1, -0.3], [-0.1, 0.3], [-0.4, 0.3]])
 RIGHT = LEFT + [0.5, 0]
@@ -157,7 +157,7 @@ def test_every_detector_heeds_the_masks(project, tmp_path, source):
         },
         Path("t.yaml"),
     )
-    facts = preparing.prepare(Run(config, tmp_path / "run", data_root=tmp_path, threads=2))
+    facts = prepare.prepare(Run(config, tmp_path / "run", data_root=tmp_path, threads=2))
     views = read_views(tmp_path / "run" / "views.npz")
     assert facts["masked_edgels"] > 100
     for view in range(3):

@@ -7,18 +7,10 @@ import pytest
 from placed_shapes import KINDS, PLANE, Placing, any_shape
 from scipy.spatial import cKDTree
 
-from taichi_edges.edges.model_selection import (
-    OUTLIER,
-    Track,
-    Yardstick,
-    best_shape,
-    distances_to,
-    misfit,
-    observations,
-    price_of,
-    track_of,
-)
-from taichi_edges.shapes import EllipticArc, Line, Spline
+from taichi_edges.fitting.distances import distances_to
+from taichi_edges.fitting.model_selection import Track, Yardstick, best_shape, misfit, observations, track_of
+from taichi_edges.fitting.prices import OUTLIER, price_of
+from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
 
 NOISE, STRETCH, SPACING = 1e-3, 0.01, 0.0025  # unit-cube units, about those of a scene of 800 x 800 pixels
 YARDSTICK = Yardstick(NOISE, STRETCH)

@@ -6,16 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from taichi_edges.cameras import OPENGL_TO_OPENCV, invert_pose
 from taichi_edges.errors import UserError
-from taichi_edges.exporters.ply import write_float_vertices
-from taichi_edges.photogrammetry import distorted_pixels
+from taichi_edges.files.ply import write_float_vertices
 from taichi_edges.progress import Progress
 from taichi_edges.readers.frames import camera_poses
 from taichi_edges.readers.nerfstudio import read_nerfstudio
+from taichi_edges.readers.photogrammetry import distorted_pixels
 from taichi_edges.readers.undistortion import undistorted_frames
-from taichi_edges.scene import SourceConfig
+from taichi_edges.scene.settings import SourceConfig
 from taichi_edges.synthetic.rendering import ring_cameras
+from taichi_edges.views.cameras import OPENGL_TO_OPENCV, invert_pose
 
 VIEWS, WIDTH, HEIGHT = 4, 64, 48
 INTRINSICS = {"fl_x": 70.0, "fl_y": 68.0, "cx": 31.0, "cy": 25.0, "w": WIDTH, "h": HEIGHT}

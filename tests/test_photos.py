@@ -12,17 +12,17 @@ import pycolmap
 import pytest
 from told import Told
 
-from taichi_edges import photogrammetry, preparing, stages
-from taichi_edges.cameras import invert_pose
+from taichi_edges.corridor import evaluate, prepare, sources
+from taichi_edges.corridor.pipeline import Run
 from taichi_edges.errors import UserError
-from taichi_edges.photogrammetry import image_pairs
-from taichi_edges.pipeline import Run
-from taichi_edges.readers import photos
+from taichi_edges.readers import photogrammetry, photos
 from taichi_edges.readers.images import read_grey
+from taichi_edges.readers.photogrammetry import image_pairs
 from taichi_edges.readers.photos import posed_photos, read_photos
-from taichi_edges.readers.picture_sizes import picture_size
-from taichi_edges.scene_file import check_scene
+from taichi_edges.scene.scene_file import check_scene
 from taichi_edges.synthetic.rendering import look_at
+from taichi_edges.views.cameras import invert_pose
+from taichi_edges.views.picture_sizes import picture_size
 
 SIZE, FOCAL = (320, 240), 330.0
 VIEWS = 6
@@ -130,11 +130,11 @@ def test_edges_are_prepared_from_photographs_alone(album, solved, tmp_path):
     scene = {"name": "album", "source": {"reader": "images", "path": str(album[0])}}
     told = Told()
     run = Run(check_scene(scene, Path("album.yaml")), tmp_path / "run", threads=2, progress=told)
-    facts = preparing.prepare(run)
+    facts = prepare.prepare(run)
     assert facts["views"] + len(facts["held_out"]) == VIEWS and facts["box_from"] == "reader" and facts["edgels"] > 1000
     assert "seeds.ply" in facts["files"] and (run.folder / "undistorted" / "images" / "photo 0.png").is_file()
     assert any(
-        str(path).endswith("thumb.png") for path in preparing.source_files(run)
+        str(path).endswith("thumb.png") for path in sources.source_files(run)
     )  # it may register when others change
 
 
@@ -271,11 +271,11 @@ def test_maps_for_a_scan_are_found_where_photographs_have_no_poses(album, solved
     evaluation = {"kind": "scan", "truth": "scan.ply", "scan": {"edges": "maps"}}
     scene = {"name": "album", "source": source, "evaluation": evaluation}
     run = Run(check_scene(scene, Path("album.yaml")), tmp_path / "run", threads=2, progress=Told())
-    frames = preparing.posed_frames(run, preparing.listed_frames(run))
+    frames = sources.posed_frames(run, sources.listed_frames(run))
     names = frames.names[1:]  # prepare has left one out
     size = photogrammetry.undistorted(frames.lenses[0])[1]
     views = SimpleNamespace(names=names[:-1], edge_maps=np.zeros((1, *size[::-1]), np.uint8))
-    maps = stages._scan_maps(run, views, SimpleNamespace(names=names[-1:]))
+    maps = evaluate._scan_maps(run, views, SimpleNamespace(names=names[-1:]))
     assert list(maps) == names and all(found.shape == size[::-1] and found.max() > 100 for found in maps.values())
     made = run.path("undistorted_for_scan")
     assert len(list(made.glob("edges/*.png"))) == len(names) and not (made / "images").exists()

@@ -22,24 +22,24 @@ import pytest
 from part21 import read_step
 from scipy.spatial import cKDTree
 
-from taichi_edges.artefacts import digest_file, remove_unfinished, replacing
-from taichi_edges.cameras import Similarity, invert_pose
-from taichi_edges.command import print_summary
-from taichi_edges.edge_set import EdgeSet, read_edges, write_edges
-from taichi_edges.edges.refinement import RefineCounts
+from taichi_edges.corridor.command import print_summary
+from taichi_edges.corridor.evaluate import evaluate
+from taichi_edges.corridor.findings import FINDINGS
+from taichi_edges.corridor.pipeline import STAGES, Run, run_stages
 from taichi_edges.errors import UserError
-from taichi_edges.evaluation.held_out import split_views
 from taichi_edges.exporters.point_cloud import read_oriented_points
-from taichi_edges.exporters.splats import read_gaussians
-from taichi_edges.findings import FINDINGS
-from taichi_edges.pipeline import STAGES, Run, run_stages
+from taichi_edges.files.artefacts import digest_file, remove_unfinished, replacing
+from taichi_edges.files.splats import read_gaussians
+from taichi_edges.geometry.edge_set import EdgeSet, read_edges, write_edges
+from taichi_edges.geometry.wireframe import read_wireframe
 from taichi_edges.progress import PlainProgress, TerminalProgress
 from taichi_edges.readers.points import read_points
-from taichi_edges.scene_file import check_scene, load_scene, parse_yaml
-from taichi_edges.splatting.seeding import given_points
-from taichi_edges.stages import evaluate
-from taichi_edges.views import Views, read_views, write_views
-from taichi_edges.wireframe import read_wireframe
+from taichi_edges.refinement.stage import RefineCounts
+from taichi_edges.scene.scene_file import check_scene, load_scene, parse_yaml
+from taichi_edges.seeding.starts import given_points
+from taichi_edges.views.cameras import Similarity, invert_pose
+from taichi_edges.views.splitting import split_views
+from taichi_edges.views.views import Views, read_views, write_views
 
 ROOT = Path(__file__).parent.parent
 ARTEFACTS = (
@@ -82,7 +82,7 @@ KILLER = """
 import os, signal, sys
 sys.path.insert(0, {root!r})
 import run
-from taichi_edges import artefacts, preparing, stages
+from taichi_edges.files import artefacts
 
 def die(*arguments, **options):
     os.kill(os.getpid(), signal.SIGKILL)
@@ -100,15 +100,15 @@ sys.exit(run.main({arguments!r}))
 """
 KILLED_IN = {
     # after the pictures, while views.npz is being written
-    "prepare": "preparing.write_views = write_half",
+    "prepare": "from taichi_edges.corridor import edgels_of_views; edgels_of_views.write_views = write_half",
     # after a whole training, when gaussians.ply is half written
-    "train": "from taichi_edges.exporters import splats; splats.write_gaussians = write_half",
+    "train": "from taichi_edges.files import splats; splats.write_gaussians = write_half",
     # between points.ply and clusters.npz
-    "cluster": "stages.np.savez_compressed = die",
-    "fit": "stages.write_wireframe = write_half",
-    "refine": "from taichi_edges.edges import refinement; refinement.refine_wireframe = die",
+    "cluster": "import numpy; numpy.savez_compressed = die",
+    "fit": "from taichi_edges.corridor import fit; fit.write_wireframe = write_half",
+    "refine": "from taichi_edges.refinement import stage; stage.refine_wireframe = die",
     # between metrics.json and metrics.csv
-    "evaluate": "stages._write_csv = write_half",
+    "evaluate": "from taichi_edges.corridor import evaluate; evaluate.write_csv = write_half",
     "export": "from taichi_edges.exporters import overlays; overlays.contact_sheet = die",
 }
 
@@ -413,7 +413,7 @@ def test_a_stage_whose_inputs_come_out_the_same_is_skipped(copied):
 
 def test_another_version_of_a_package_makes_those_stages_stale_that_use_it(copied, monkeypatch):
     """A new ezdxf writes another DXF; nothing is trained again for it."""
-    from taichi_edges import pipeline
+    from taichi_edges.corridor import pipeline
 
     monkeypatch.setattr(pipeline, "version", lambda name: "99.0" if name == "ezdxf" else version(name))
     pipeline._versions.cache_clear()
@@ -793,7 +793,7 @@ def test_temporary_files_of_the_dead_are_removed_and_those_of_the_living_stay(tm
 HOLDER = """
 import sys
 from pathlib import Path
-from taichi_edges.artefacts import locked
+from taichi_edges.files.artefacts import locked
 
 with locked(Path(sys.argv[1])):
     print("locked", flush=True)

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from test_onnx import grey_kernel, node, write_network
 
-from taichi_edges import preparing
-from taichi_edges.cameras import invert_pose
+from taichi_edges.corridor import prepare as stage
+from taichi_edges.corridor.pipeline import Run
 from taichi_edges.errors import UserError
-from taichi_edges.pipeline import Run
 from taichi_edges.progress import Progress
-from taichi_edges.scene_file import check_scene
+from taichi_edges.scene.scene_file import check_scene
 from taichi_edges.synthetic.drawing import Imperfections
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import render_views
-from taichi_edges.views import read_views
+from taichi_edges.views.cameras import invert_pose
+from taichi_edges.views.views import read_views
 
 VIEWS, SIZE = 6, 160
 SIDES = np.array([[-1.0, 0, 1], [-2, 0, 2], [-1, 0, 1]]) / 20  # logits from grey levels: vertical edges
@@ -68,7 +68,7 @@ def prepare(tmp_path, folder):
         config = check_scene({"name": "test", "source": source, **scene}, Path("test.yaml"))
         (tmp_path / "run").mkdir(exist_ok=True)
         run = Run(config, tmp_path / "run", threads=2, progress=Warnings())
-        facts = preparing.prepare(run)
+        facts = stage.prepare(run)
         return facts, read_views(run.path("views.npz")), run.progress.texts
 
     return run_prepare
@@ -196,7 +196,7 @@ def test_a_network_from_a_file(prepare, tmp_path):
 def test_a_synthetic_scene_can_be_traced_in_its_own_pictures(tmp_path):
     source = {"reader": "synthetic", "part": "block", "views": 4, "size": 120, "detector": "subpixel"}
     run = Run(check_scene({"name": "test", "source": source}, Path("x.yaml")), tmp_path, threads=1)
-    facts = preparing.prepare(run)
+    facts = stage.prepare(run)
     assert facts["part"] == "block" and "line_width_px" not in facts and facts["edgels"] > 200
     assert (tmp_path / "truth.json").is_file()
 
@@ -261,7 +261,7 @@ def test_images_of_16_bits_calibrate_as_those_of_8_do(prepare, folder):
 def test_the_sheet_shows_what_the_training_gets(prepare, monkeypatch, source):
     shown = {}
     monkeypatch.setattr(
-        "taichi_edges.exporters.detection_sheet.write_detection_sheet",
+        "taichi_edges.detectors.detection_sheet.write_detection_sheet",
         lambda path, views, **residuals: shown.update(views=views, residuals=residuals),
     )
     facts, views, _ = prepare({**source, "min_chain": 30})

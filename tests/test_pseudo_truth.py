@@ -8,24 +8,24 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from taichi_edges.cameras import Similarity, invert_pose
+from taichi_edges.corridor.evaluate import evaluate as evaluate_stage
+from taichi_edges.corridor.pipeline import Run
+from taichi_edges.corridor.sources import truth_files
 from taichi_edges.detectors.ridges import trace_ridges
-from taichi_edges.edge_set import write_edges
 from taichi_edges.errors import UserError
 from taichi_edges.evaluation.dense_curves import dense_curves, middle_samples
-from taichi_edges.evaluation.held_out import split_views
 from taichi_edges.evaluation.metrics import evaluate, exact_polylines
 from taichi_edges.evaluation.projected_curves import Camera
 from taichi_edges.evaluation.pseudo_truth import Votes, points_in_box, pseudo_truth
-from taichi_edges.exporters.ply import read_vertices, write_float_vertices
-from taichi_edges.pipeline import Run
-from taichi_edges.scene_file import check_scene
-from taichi_edges.stages import evaluate as evaluate_stage
-from taichi_edges.stages import truth_files
+from taichi_edges.files.ply import read_vertices, write_float_vertices
+from taichi_edges.geometry.edge_set import write_edges
+from taichi_edges.scene.scene_file import check_scene
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import Imperfections, pixel_size, render_edge_maps, ring_cameras
 from taichi_edges.synthetic.visibility import LIFT, ray_scene
-from taichi_edges.views import Views, write_views
+from taichi_edges.views.cameras import Similarity, invert_pose
+from taichi_edges.views.splitting import split_views
+from taichi_edges.views.views import Views, write_views
 
 SIZE, VIEWS, POINTS = 800, 12, 300_000
 CONFIG = SimpleNamespace(share=0.5, views=3)

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from taichi_edges.cameras import OPENGL_TO_OPENCV, inside_image, invert_pose, project
 from taichi_edges.errors import UserError
 from taichi_edges.progress import Progress
 from taichi_edges.readers import READERS
 from taichi_edges.readers.frames import build_views, chosen_frames
 from taichi_edges.readers.images import read_edge_maps, read_grey
-from taichi_edges.scene import SourceConfig
+from taichi_edges.scene.settings import SourceConfig
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import Imperfections, render_edge_maps, ring_cameras
+from taichi_edges.views.cameras import OPENGL_TO_OPENCV, inside_image, invert_pose, project
 
 SIZE = 64
 VIEWS = 4

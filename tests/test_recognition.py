@@ -11,7 +11,7 @@ import pytest
 
 from taichi_edges.errors import UserError
 from taichi_edges.readers.recognition import recognise, recognised_source, scene_name
-from taichi_edges.scene import SourceConfig
+from taichi_edges.scene.settings import SourceConfig
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))

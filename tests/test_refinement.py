@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from edgel_scenes import views_of
 
-from taichi_edges.edges.model_selection import distances_to
-from taichi_edges.edges.refinement import RefineCounts, refine_wireframe
-from taichi_edges.pipeline import Run
+from taichi_edges.corridor.pipeline import Run
+from taichi_edges.corridor.refine import refine
+from taichi_edges.fitting.distances import distances_to
+from taichi_edges.geometry.shapes import EllipticArc, Line, polyline
+from taichi_edges.geometry.wireframe import Wireframe, read_wireframe, write_wireframe
 from taichi_edges.progress import Progress
-from taichi_edges.scene import RefineConfig
-from taichi_edges.scene_file import check_scene
-from taichi_edges.shapes import EllipticArc, Line, polyline
-from taichi_edges.stages import refine
-from taichi_edges.views import pixel_size, write_views
-from taichi_edges.wireframe import Wireframe, read_wireframe, write_wireframe
+from taichi_edges.refinement.stage import RefineCounts, refine_wireframe
+from taichi_edges.scene.scene_file import check_scene
+from taichi_edges.scene.settings import RefineConfig
+from taichi_edges.views.views import pixel_size, write_views
 
 LOW, HIGH, RADIUS = np.array([0.3, 0.35, 0.4]), np.array([0.7, 0.65, 0.55]), 0.08
 ENABLED = RefineConfig(enabled=True)

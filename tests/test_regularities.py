@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from edgel_scenes import views_of
 
-from taichi_edges.edges.adjustment import adjusted
-from taichi_edges.edges.regularities import KINDS, regularised
-from taichi_edges.kernels.edgel_matching import EdgelMatching
-from taichi_edges.shapes import EllipticArc, Line
-from taichi_edges.wireframe import Edge, Wireframe
+from taichi_edges.evidence.edgel_matching import EdgelMatching
+from taichi_edges.geometry.shapes import EllipticArc, Line
+from taichi_edges.geometry.wireframe import Edge, Wireframe
+from taichi_edges.refinement.adjustment import adjusted
+from taichi_edges.refinement.regularities import KINDS, regularised
 
 TURN = np.linalg.qr(np.array([[0.8, 0.1, -0.2], [0.3, 0.9, 0.1], [0.1, -0.4, 0.7]]))[0]  # the box is aligned to nothing
 NOISE_PX = 0.15

@@ -6,8 +6,9 @@ import pytest
 import yaml
 
 from taichi_edges.errors import UserError
-from taichi_edges.scene import PRESETS, SCALES, SCALES_OF_READERS, SceneConfig
-from taichi_edges.scene_file import check_scene, load_scene
+from taichi_edges.scene.presets import PRESETS, SCALES, SCALES_OF_READERS
+from taichi_edges.scene.scene_file import check_scene, load_scene
+from taichi_edges.scene.settings import SceneConfig
 
 SCENES = sorted((Path(__file__).parent.parent / "scenes").glob("*.yaml"))
 SYNTHETIC = "source: {reader: synthetic, part: block}\n"

@@ -7,14 +7,14 @@ import pytest
 import reference_support as reference
 from scipy.spatial import cKDTree
 
-from taichi_edges import stages
-from taichi_edges.exporters.ply import write_float_vertices
-from taichi_edges.pipeline import Run
-from taichi_edges.scene import SceneConfig
-from taichi_edges.splatting import voting
+from taichi_edges.corridor import train
+from taichi_edges.corridor.pipeline import Run
+from taichi_edges.files.ply import write_float_vertices
+from taichi_edges.scene.settings import SceneConfig
+from taichi_edges.seeding import voting
+from taichi_edges.seeding.starts import random_points
+from taichi_edges.seeding.voting import DistanceBatches, line_directions, nearly_best, vote_cells, vote_seeds
 from taichi_edges.splatting.gaussians import orient_gaussians
-from taichi_edges.splatting.seeding import random_points
-from taichi_edges.splatting.voting import DistanceBatches, line_directions, nearly_best, vote_cells, vote_seeds
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import Imperfections, render_views
 
@@ -194,7 +194,7 @@ def test_without_votes_the_training_starts_from_the_given_or_random_points(
     source = {"reader": "emap", "path": "there", "points": points}
     config = SceneConfig(source=source, train={"seeds": "votes", "gaussians": 300})
     warned = Warned()
-    gaussians = stages._start(Run(config, tmp_path, progress=warned), blank, np.random.default_rng(0))
+    gaussians = train.start_of_training(Run(config, tmp_path, progress=warned), blank, np.random.default_rng(0))
     assert len(warned.lines) == 1 and warned.lines[0].endswith(f"the training starts from {named} instead")
     assert "poses or intrinsics may not be those of these images" in warned.lines[0]
     assert len(gaussians) == (80 if points else 300)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from placed_shapes import KINDS, PLANE, Placing, any_shape
 
-from taichi_edges.bezier import evaluate_bezier
-from taichi_edges.edges.arcs import Arc, through_three
-from taichi_edges.shapes import EllipticArc, Line, bounds_of, near_bounds, polyline
+from taichi_edges.fitting.arcs import Arc, through_three
+from taichi_edges.geometry.bezier import evaluate_bezier
+from taichi_edges.geometry.shapes import EllipticArc, Line, bounds_of, near_bounds, polyline
 
 NAMES = {"long_arc": "arc", "long_elliptic_arc": "elliptic_arc", "loop": "spline"}
 HALF_STEP = 1e-6  # of the parameter, over which slow tangents are differences

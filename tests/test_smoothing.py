@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from taichi_edges.edgels import Edgels
-from taichi_edges.kernels.smoothing import LEAST_AROUND, with_smooth_normals
+from taichi_edges.detectors.smoothing import LEAST_AROUND, with_smooth_normals
+from taichi_edges.views.edgels import Edgels
 
 SIZE = 240
 NOISE_PX, TURNED = 0.15, 3.0  # of detected edgels: px across the edge; degrees, of a single normal

@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from taichi_edges.detectors.pictures import as_picture, levels_per_light, read_picture
 from taichi_edges.detectors.subpixel import detect_edgels, trace_pictures
 from taichi_edges.errors import UserError
-from taichi_edges.light import light_of_srgb
+from taichi_edges.views.light import light_of_srgb
+from taichi_edges.views.pictures import as_picture, levels_per_light, read_picture
 
 SIZE = 96
 FINE = 16  # samples along each side of a pixel inside a circle

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 import reference_support as reference
 
-from taichi_edges import support
-from taichi_edges.detectors.drawing import draw_lines
-from taichi_edges.kernels import evidence
-from taichi_edges.kernels.evidence import Evidence
-from taichi_edges.support import edge_strength, exclusive_support, line_width
+from taichi_edges.evidence import pixel_owners, support
+from taichi_edges.evidence.pixel_owners import Evidence
+from taichi_edges.evidence.support import edge_strength, exclusive_support, line_width
 from taichi_edges.synthetic.rendering import ring_cameras
-from taichi_edges.views import Views
+from taichi_edges.views.drawing import draw_lines
+from taichi_edges.views.views import Views
 
 SIZE, VIEWS = 200, 24
 
@@ -164,10 +163,10 @@ def test_batches_and_repeated_claims_do_not_change_the_support(taichi, generator
     assert len(shown.batches) == 1
     expected = reference.exclusive_support(views, points, 0.5, shown.strength)
     np.testing.assert_array_equal(exclusive_support(views, points, 0.5), expected)
-    monkeypatch.setattr(evidence, "BATCH_BYTES", 3 * 4 * (44 * 60 + len(points)))
+    monkeypatch.setattr(pixel_owners, "BATCH_BYTES", 3 * 4 * (44 * 60 + len(points)))
     assert len(Evidence(views, points.astype(np.float32), 0.5).batches) == 3
     np.testing.assert_array_equal(exclusive_support(views, points, 0.5), expected)
-    monkeypatch.setattr(evidence, "LARGEST_I32", 4 * len(points))  # the claims start anew every third time
+    monkeypatch.setattr(pixel_owners, "LARGEST_I32", 4 * len(points))  # the claims start anew every third time
     np.testing.assert_array_equal(exclusive_support(views, points, 0.5), expected)
 
 

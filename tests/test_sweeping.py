@@ -7,13 +7,12 @@ import pytest
 from edgel_scenes import arc, blank_views, distances_to, line, tangents, views_of
 from scipy.spatial import cKDTree
 
-from taichi_edges import stages
-from taichi_edges.edgels import Edgels
-from taichi_edges.pipeline import Run
+from taichi_edges.corridor import train
+from taichi_edges.corridor.pipeline import Run
 from taichi_edges.progress import Progress
-from taichi_edges.scene import SceneConfig
-from taichi_edges.splatting import sweeping
-from taichi_edges.splatting.sweeping import (
+from taichi_edges.scene.settings import SceneConfig
+from taichi_edges.seeding import sweeping
+from taichi_edges.seeding.sweeping import (
     LEAST_COMPANIONS,
     SweepSeeds,
     best_seeds,
@@ -25,7 +24,8 @@ from taichi_edges.splatting.sweeping import (
     swept_gaussians,
 )
 from taichi_edges.synthetic.rendering import look_at
-from taichi_edges.views import pixel_size
+from taichi_edges.views.edgels import Edgels
+from taichi_edges.views.views import pixel_size
 
 UPRIGHT = line([0.3, 0.4, 0.2], [0.3, 0.4, 0.8])
 LEVEL = line([0.3, 0.25, 0.5], [0.8, 0.3, 0.5])
@@ -294,7 +294,7 @@ class Warned(Progress):
 def test_three_views_are_too_few_to_sweep_and_start_from_votes(taichi, generator, tmp_path):
     config = SceneConfig(source={"reader": "emap", "path": "there"}, train={"seeds": "sweep", "gaussians": 300})
     warned, views = Warned(), views_of(CURVES, generator, count=3)
-    stages._start(Run(config, tmp_path, progress=warned), views, np.random.default_rng(0))
+    train.start_of_training(Run(config, tmp_path, progress=warned), views, np.random.default_rng(0))
     assert warned.lines[0].startswith("fewer than 4 views see the same")
     assert warned.lines[0].endswith("the training starts from votes")
 
@@ -302,7 +302,9 @@ def test_three_views_are_too_few_to_sweep_and_start_from_votes(taichi, generator
 def test_without_seeds_the_training_says_so_and_starts_from_random_points(taichi, tmp_path):
     config = SceneConfig(source={"reader": "emap", "path": "there"}, train={"seeds": "sweep", "gaussians": 300})
     warned = Warned()
-    gaussians = stages._start(Run(config, tmp_path, progress=warned), without_edgels(8), np.random.default_rng(0))
+    gaussians = train.start_of_training(
+        Run(config, tmp_path, progress=warned), without_edgels(8), np.random.default_rng(0)
+    )
     assert len(gaussians) == 300 and len(warned.lines) == 1
     assert "the views agree on an edge in fewer than 50 places" in warned.lines[0]
     assert warned.lines[0].endswith("the training starts from random points instead")

@@ -8,9 +8,8 @@ import pytest
 from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.spatial import cKDTree
 
-from taichi_edges.bezier import evaluate_bezier
-from taichi_edges.cameras import inside_image, project
-from taichi_edges.support import edge_strength
+from taichi_edges.evidence.support import edge_strength
+from taichi_edges.geometry.bezier import evaluate_bezier
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.profiles import CHORD_ERROR, Profile, circle, polygon, rectangle, slot
 from taichi_edges.synthetic.rendering import (
@@ -24,6 +23,7 @@ from taichi_edges.synthetic.rendering import (
 from taichi_edges.synthetic.solids import assemble, extrude
 from taichi_edges.synthetic.surfaces import cap, wall
 from taichi_edges.synthetic.visibility import ray_scene, sample_edges, visible_from
+from taichi_edges.views.cameras import inside_image, project
 
 SIZE = 300
 CLEAN = Imperfections.none()

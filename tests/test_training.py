@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from taichi_edges.detectors.drawing import draw_edge_maps
 from taichi_edges.detectors.ridges import trace_ridges
 from taichi_edges.errors import UserError
+from taichi_edges.evidence.support import line_width
 from taichi_edges.progress import Progress
-from taichi_edges.scene import DensityConfig, LearningRates, TrainConfig
+from taichi_edges.scene.settings import DensityConfig, LearningRates, TrainConfig
+from taichi_edges.seeding.starts import random_points
 from taichi_edges.splatting.density import Population, cull_opacity, cull_support, duplicate
 from taichi_edges.splatting.gaussians import Gaussians, logit, start_gaussians
-from taichi_edges.splatting.seeding import random_points
 from taichi_edges.splatting.training import Settling, Training, nearest_neighbors, rates
-from taichi_edges.support import line_width
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import Imperfections, render_views
 from taichi_edges.synthetic.visibility import sample_edges
+from taichi_edges.views.drawing import draw_edge_maps
 
 PIXEL = 0.02  # unit-cube units, in views of 96 x 96: the cube is some 60 px wide
 

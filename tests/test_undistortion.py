@@ -9,12 +9,12 @@ from colmap_projects import LENSES, SIZE, camera, picture_of_polygon
 
 from taichi_edges.detectors.subpixel import detect_edgels
 from taichi_edges.errors import UserError
-from taichi_edges.photogrammetry import Lens, undistorted
 from taichi_edges.progress import Progress
 from taichi_edges.readers import undistortion
 from taichi_edges.readers.frames import Frames
-from taichi_edges.readers.picture_sizes import picture_size
+from taichi_edges.readers.photogrammetry import Lens, undistorted
 from taichi_edges.readers.undistortion import undistorted_frames, undistortion_map
+from taichi_edges.views.picture_sizes import picture_size
 
 POLYGON = np.array([[-0.3, -0.2], [0.25, -0.28], [0.33, 0.1], [0.05, 0.3], [-0.33, 0.15]])
 DISTORTED = [name for name in LENSES if not name.endswith("PINHOLE")]

@@ -16,15 +16,16 @@ from edgel_scenes import (
     views_of,
 )
 
-from taichi_edges.edgels import Edgels
-from taichi_edges.edges.filtering import filter_points, judge
-from taichi_edges.edges.growing import grow_points
-from taichi_edges.explaining import explain, unexplained
-from taichi_edges.kernels.edgel_matching import CELL, EdgelMatching
-from taichi_edges.scene import FilterConfig
+from taichi_edges.evidence.edgel_matching import EdgelMatching
+from taichi_edges.evidence.explaining import explain, unexplained
+from taichi_edges.evidence.viewing_planes import RADII_PX, refine_points
+from taichi_edges.kernels.edgel_grid import CELL
+from taichi_edges.points.filtering import filter_points, judge
+from taichi_edges.points.growing import grow_points
+from taichi_edges.scene.settings import FilterConfig
 from taichi_edges.synthetic.rendering import ring_cameras
-from taichi_edges.viewing_planes import RADII_PX, refine_points
-from taichi_edges.views import read_views, write_views
+from taichi_edges.views.edgels import Edgels
+from taichi_edges.views.views import read_views, write_views
 
 A = line([0.2, 0.3, 0.3], [0.8, 0.35, 0.4])
 RIM = arc([0.5, 0.5, 0.6], 0.25)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from edgel_scenes import SIZE, blank_views, line, views_of
 
-from taichi_edges.cameras import Similarity
 from taichi_edges.readers.frames import _pixel_at
 from taichi_edges.synthetic.rendering import look_at
-from taichi_edges.views import pixel_size, read_views, write_views
+from taichi_edges.views.cameras import Similarity
+from taichi_edges.views.views import pixel_size, read_views, write_views
 
 
 @pytest.mark.parametrize("pixel, tolerance", [(None, 0.5), (0.0031, 0.7), (1e-5, 1.25)])

@@ -4,15 +4,16 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from taichi_edges.bezier import bezier_lengths, evaluate_bezier
-from taichi_edges.edges.arc_growth import Cloud, Scale
-from taichi_edges.edges.arcs import Arc, fit_arc
-from taichi_edges.edges.assembly import assemble, fit_assembly, pack_arc, unpack_arc
-from taichi_edges.edges.clustering import UNASSIGNED, alignment, neighbor_graph, seed_order
-from taichi_edges.edges.free_curves import free_curves
-from taichi_edges.edges.merging import Piece
-from taichi_edges.edges.noise import LEAST_NOISE, measured_scale
-from taichi_edges.scene import ClusterConfig, FitConfig
+from taichi_edges.fitting.arcs import Arc, fit_arc
+from taichi_edges.geometry.bezier import bezier_lengths, evaluate_bezier
+from taichi_edges.scene.settings import ClusterConfig, FitConfig
+from taichi_edges.strokes.arc_growth import Cloud, Scale
+from taichi_edges.strokes.assembly import assemble, fit_assembly, pack_arc, unpack_arc
+from taichi_edges.strokes.clustering import seed_order
+from taichi_edges.strokes.free_curves import free_curves
+from taichi_edges.strokes.merging import Piece
+from taichi_edges.strokes.neighbors import UNASSIGNED, alignment, neighbor_graph
+from taichi_edges.strokes.noise import LEAST_NOISE, measured_scale
 
 SPACING = 0.003  # unit-cube units between neighbouring points, as on real scenes
 NOISES = (1e-4, 3e-4, 1e-3)  # unit-cube units: images, images with less sure edges, detectors' maps

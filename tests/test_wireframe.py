@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from placed_shapes import KINDS, Placing, any_shape
 
-from taichi_edges.edge_set import EdgeSet, write_edges
 from taichi_edges.errors import UserError
-from taichi_edges.shapes import Line, Spline
-from taichi_edges.wireframe import Edge, Evidence, Wireframe, read_wireframe, write_wireframe
+from taichi_edges.geometry.edge_set import EdgeSet, write_edges
+from taichi_edges.geometry.shapes import Line, Spline
+from taichi_edges.geometry.wireframe import Edge, Evidence, Wireframe, read_wireframe, write_wireframe
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 SEEN = Evidence(7, 0.25, 0.1 + 0.2, 1 / 3)  # numbers that a few decimals would not keep

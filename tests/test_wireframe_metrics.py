@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from true_shapes import assert_perfect, circle_pieces, line, truth_of
 
-from taichi_edges.edge_set import EdgeSet, write_edges
 from taichi_edges.evaluation.ground_truth import GroundTruth, read_ground_truth
 from taichi_edges.evaluation.metrics import evaluate, metrics_rows
+from taichi_edges.geometry.edge_set import EdgeSet, write_edges
 from taichi_edges.synthetic.parts import PARTS
 
 CORNERS = 0.4 * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])

@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from taichi_edges.cameras import OPENGL_TO_OPENCV, invert_pose
-from taichi_edges.exporters.ply import write_float_vertices
+from taichi_edges.files.ply import write_float_vertices
 from taichi_edges.synthetic.drawing import Imperfections
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import render_views
+from taichi_edges.views.cameras import OPENGL_TO_OPENCV, invert_pose
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 from run import main  # noqa: E402

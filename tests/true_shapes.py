@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from taichi_edges.bezier import bernstein
-from taichi_edges.edge_set import EdgeSet
 from taichi_edges.evaluation.ground_truth import GroundTruth
+from taichi_edges.geometry.bezier import bernstein
+from taichi_edges.geometry.edge_set import EdgeSet
 
 
 def line(start, end):

@@ -24,9 +24,9 @@ def detect_subpixel(frames, run):
     """Edgels by our own detector, and maps drawn through them."""
     import numpy as np
 
-    from taichi_edges.detectors.drawing import draw_edge_maps
     from taichi_edges.detectors.subpixel import trace_pictures
     from taichi_edges.readers.images import check_sizes, frames_with_images, name_edgeless
+    from taichi_edges.views.drawing import draw_edge_maps
 
     frames = frames_with_images(frames, run.progress)
     with run.progress.track("detect", len(frames.names)) as report:
@@ -65,7 +65,7 @@ class ComposedImages:
         return len(self.paths)
 
     def __getitem__(self, index):
-        from taichi_edges.detectors.pictures import read_colour
+        from taichi_edges.views.pictures import read_colour
 
         colour = read_colour(self.paths[index])
         if colour is None:

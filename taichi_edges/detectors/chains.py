@@ -64,7 +64,7 @@ def with_chain_strengths(edgels, height, width):
     An edgel is as sure as its whole chain, if each SURE_PX of that could be wrong by themselves, and its normal is the
     chain's there. ti.init must have been called. height, width: pixels.
     """
-    from taichi_edges.kernels.smoothing import with_smooth_normals
+    from taichi_edges.detectors.smoothing import with_smooth_normals
 
     edgels = with_smooth_normals(edgels, height, width)
     lengths = chain_lengths(edgels)

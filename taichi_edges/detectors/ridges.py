@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import cv2
 import numpy as np
 
-from taichi_edges.edgels import Edgels
+from taichi_edges.views.edgels import Edgels
 
 SIGMA_PER_WIDTH = 0.29  # 1 / (2 sqrt 3): the smallest scale at which a bar of that width has one ridge (Steger, eq. 17)
 MIN_SIGMA = 0.65  # px; below, the derivative of the Gaussian is not sampled well

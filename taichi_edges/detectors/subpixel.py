@@ -25,9 +25,9 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from taichi_edges.detectors.pictures import Picture, as_picture, levels_per_light, read_picture
 from taichi_edges.detectors.ridges import gaussian_derivatives
-from taichi_edges.edgels import Edgels
+from taichi_edges.views.edgels import Edgels
+from taichi_edges.views.pictures import Picture, as_picture, levels_per_light, read_picture
 
 # px, smoothing. The first is about the smallest whose derivative is sampled well; it keeps edges 2 px apart separate.
 # The noise of the gradient falls with the square of the scale.

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_edges.cameras import Similarity
-from taichi_edges.edge_set import EdgeSet, read_edges
 from taichi_edges.errors import UserError, did_you_mean, name_some
+from taichi_edges.geometry.edge_set import EdgeSet, read_edges
+from taichi_edges.views.cameras import Similarity
 
 ABC_SPACING = 0.005  # raw CAD units (!), EMAP get_gt_points: the spacing in the unit cube differs from model to model
 EDGE_FILE_SPACING = 0.0005  # normalised units: a tenth of the finest threshold, so the sampling does not show

@@ -7,23 +7,17 @@ to be hidden from there, and is not judged. A place that no more of them see tha
 edge that does not exist.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from taichi_edges.edgels import Edgels
-from taichi_edges.errors import UserError, did_you_mean
 from taichi_edges.evaluation.edgel_index import MOST_SINE, EdgelIndex
 from taichi_edges.evaluation.projected_curves import Camera, Chords
-from taichi_edges.views import pixel_size
+from taichi_edges.views.splitting import LEAST_LEFT
+from taichi_edges.views.views import pixel_size
 
-FEWEST_VIEWS, SHARE, MOST = 8, 10, 3  # auto: from so many views on, one in ten of them, at most three
-LEAST_LEFT = 3  # views to find edges in: the viewing planes of two always meet
-MATCH_PX = 1.5  # an edge and an edgel so near are one, if they are parallel too (MOST_SINE); as in edges/evidence.py
-REACH_PX = (
-    3.0  # within which residuals are looked at, and misplaced edges still seen: what is this far off is no match,
-)
-# but neither hidden
+MATCH_PX = 1.5  # an edge and an edgel so near are one, if they are parallel too (MOST_SINE); as in `edge_support`
+REACH_PX = 3.0  # within which residuals are looked at: what is this far off is no match, but neither hidden
 SPACING_PX = 0.75  # of the samples of a projected edge: edgels are about 1 px apart
 PLACE_PX = 4.0  # between the places of an edge that the views are asked about, at the middle of the scene box
 MOST_PLACES = 20_000  # of all edges; where these are longer, the places are farther apart
@@ -37,52 +31,6 @@ ASIDE_EVERY = 4  # samples that are displaced: chance needs no more
 
 
 # ------------------------------------------------------------------------------------------ which views are held out
-
-
-def choose_held_out(names, wanted):
-    """Indices of the views to hold out, ascending. wanted: 'auto', 'off', a number, or a tuple of names.
-
-    Those that `auto` and a number choose are in the middles of equal stretches of all views; the first and the last
-    stay, at the ends of a path of cameras.
-    """
-    if isinstance(wanted, (tuple, list)):
-        for name in wanted:
-            if name not in names:
-                raise UserError(f"evaluation.held_out: there is no view '{name}'{did_you_mean(name, list(names))}")
-        chosen = {list(names).index(name) for name in wanted}
-    else:
-        count = {"off": 0, "auto": _automatic(len(names))}.get(wanted, wanted)
-        middles = ((2 * number + 1) * len(names) // (2 * count) for number in range(count))
-        chosen = {min(max(middle, 1), len(names) - 2) for middle in middles}
-    left = len(names) - len(chosen)
-    if chosen and (left < LEAST_LEFT or left < len(chosen)):
-        problem = f"{len(chosen)} of {len(names)} views leave too few to find edges in"
-        raise UserError(f"evaluation.held_out: {problem}; hold out at most half of them, and leave {LEAST_LEFT}")
-    return sorted(chosen)
-
-
-def _automatic(count):
-    """How many of so many views `auto` holds out."""
-    return min((count + SHARE // 2) // SHARE, MOST) if count >= FEWEST_VIEWS else 0
-
-
-def split_views(views, held_out):
-    """Views without those at the indices `held_out`, and Views of those alone."""
-    rest = [view for view in range(len(views)) if view not in set(held_out)]
-    return _some_views(views, rest), _some_views(views, held_out)
-
-
-def _some_views(views, chosen):
-    edgels = views.edgels
-    return replace(
-        views,
-        names=tuple(views.names[view] for view in chosen),
-        image_paths=tuple(views.image_paths[view] for view in chosen),
-        edge_maps=views.edge_maps[chosen],
-        intrinsics=views.intrinsics[chosen],
-        world_to_camera=views.world_to_camera[chosen],
-        edgels=None if edgels is None else Edgels.of_views([edgels.of_view(view) for view in chosen]),
-    )
 
 
 # ------------------------------------------------------------------------------------------------------- visibility

@@ -14,13 +14,13 @@ from collections import defaultdict
 
 import numpy as np
 
-from taichi_edges.bezier import evaluate_bezier
 from taichi_edges.errors import UserError
 from taichi_edges.evaluation.dense_curves import STEP
 from taichi_edges.evaluation.duplicates import duplicated_percent
 from taichi_edges.evaluation.primitives import true_primitives
 from taichi_edges.evaluation.wireframe import free_ends, wireframe
 from taichi_edges.evaluation.wireframe_metrics import wireframe_metrics
+from taichi_edges.geometry.bezier import evaluate_bezier
 
 SAMPLE_SPACING = 0.005  # normalised units, EMAP sample_resolution
 VOXELS_PER_UNIT = 128  # EMAP: 256 voxels over [-1, 1] on each axis

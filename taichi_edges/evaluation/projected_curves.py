@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taichi_edges.cameras import NEAR
+from taichi_edges.views.cameras import NEAR
 
 
 @dataclass(frozen=True)

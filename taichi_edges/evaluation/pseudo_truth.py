@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taichi_edges.cameras import NEAR
 from taichi_edges.errors import UserError
 from taichi_edges.evaluation.ground_truth import GroundTruth
 from taichi_edges.evaluation.metrics import average_per_voxel
+from taichi_edges.views.cameras import NEAR
 
 VOXELS_PER_UNIT = 256  # EMAP: 256 voxels over [-1, 1] on each axis, of a frame in which a scene is two units long
 CELL_PX = 2  # side of the cells of a depth buffer, at least; doubled until it has no holes, that is until

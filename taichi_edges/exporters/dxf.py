@@ -8,10 +8,10 @@ import contextlib
 
 import numpy as np
 
-from taichi_edges.artefacts import replacing
 from taichi_edges.exporters.naming import edge_name, refuse_empty
 from taichi_edges.exporters.nurbs import DEGREE, joined
 from taichi_edges.exporters.palette import KIND_COLOURS
+from taichi_edges.files.artefacts import replacing
 
 VERSION = "R2010"  # the oldest that all programs of today read with true colours
 APPLICATION = "TAICHI_EDGES"

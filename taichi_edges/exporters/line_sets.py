@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from taichi_edges.artefacts import write_text
 from taichi_edges.exporters.naming import confidence_of, edge_name, evidence_words, refuse_empty
 from taichi_edges.exporters.palette import label_colours
-from taichi_edges.exporters.ply import write_elements
-from taichi_edges.shapes import polyline
+from taichi_edges.files.artefacts import write_text
+from taichi_edges.files.ply import write_elements
+from taichi_edges.geometry.shapes import polyline
 
 CURVE_SEGMENTS = 32  # for each cubic: a quarter circle in so many chords is off by 0.03 % of its radius
 

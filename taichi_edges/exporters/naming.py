@@ -2,8 +2,7 @@
 
 import math
 
-from taichi_edges.errors import UserError
-from taichi_edges.findings import amount
+from taichi_edges.errors import UserError, amount
 
 
 def edge_name(number, edge):

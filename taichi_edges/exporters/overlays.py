@@ -6,13 +6,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from taichi_edges.artefacts import replacing
-from taichi_edges.cameras import NEAR
-from taichi_edges.detectors.pictures import read_colour
 from taichi_edges.errors import UserError
 from taichi_edges.exporters.line_sets import line_set_arrays
 from taichi_edges.exporters.naming import confidence_of
 from taichi_edges.exporters.palette import CURVE_COLOUR, LINE_COLOUR
+from taichi_edges.files.artefacts import replacing
+from taichi_edges.views.cameras import NEAR
+from taichi_edges.views.pictures import SAME_SHAPE, read_colour
+from taichi_edges.views.views import choose_views
 
 OVERSAMPLING = 4  # the edges are drawn so many times larger and averaged
 SUBPIXEL_BITS = 4  # OpenCV draws in units of 1/16 pixel
@@ -31,7 +32,6 @@ SHEET_WIDTH = 1600  # pixels; a contact sheet is scaled down to this
 SHEET_GAP = 8  # pixels
 TEXT_COLOUR = (40, 40, 40)
 GREYS = np.arange(256)
-SAME_SHAPE = 0.01  # an image whose aspect is off by more is not a picture of this view
 
 
 def draw_overlays(folder, views, wireframe, count=4):
@@ -69,23 +69,6 @@ def contact_sheet(paths, out):
         sheet[top : top + height, left : left + width] = tile
     _write_png(out, sheet)
     return Path(out)
-
-
-def choose_views(views, count):
-    """Indices, in order, of at most `count` views: the first, then always the one farthest from those chosen.
-
-    Far is by the angle between viewing directions; where all look the same way, by the place in the sequence.
-    """
-    directions = views.world_to_camera[:, 2, :3]
-    order = np.arange(len(views))
-    chosen, nearest = [], np.full(len(views), np.inf)
-    for _ in range(min(count, len(views))):
-        chosen.append(int(np.argmax(nearest)))
-        angles = np.arccos(np.clip(directions @ directions[chosen[-1]], -1.0, 1.0))
-        # A thousandth of a radian for the sequence decides between equal angles and no others.
-        nearest = np.minimum(nearest, angles + 1e-3 * np.abs(order - chosen[-1]) / len(views))
-        nearest[chosen] = -1.0
-    return sorted(chosen)
 
 
 def background(views, view):

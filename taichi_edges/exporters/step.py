@@ -13,9 +13,9 @@ import math
 
 import numpy as np
 
-from taichi_edges.artefacts import write_text
 from taichi_edges.exporters.naming import edge_name, evidence_words, refuse_empty
 from taichi_edges.exporters.nurbs import DEGREE, joined
+from taichi_edges.files.artefacts import write_text
 
 SCHEMA = "AUTOMOTIVE_DESIGN { 1 0 10303 214 1 1 1 1 }"
 NO_DATE = "1970-01-01T00:00:00"  # the same edges give the same bytes

@@ -5,9 +5,9 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from taichi_edges.errors import UserError, name_some
-from taichi_edges.photogrammetry import model_files, read_reconstruction
 from taichi_edges.readers.companions import edge_paths, is_picture, mask_paths
 from taichi_edges.readers.frames import Frames
+from taichi_edges.readers.photogrammetry import model_files, read_reconstruction
 from taichi_edges.readers.scene_box import scene_box
 
 MODEL_FOLDERS = ("sparse", "colmap/sparse", "")  # each may hold a model itself, or several in folders 0, 1, ...

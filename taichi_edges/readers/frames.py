@@ -7,11 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_edges.cameras import OPENGL_TO_OPENCV, Similarity, inside_image, invert_pose, project
 from taichi_edges.errors import UserError, did_you_mean, name_some
-from taichi_edges.photogrammetry import undistorted
 from taichi_edges.progress import Progress
-from taichi_edges.readers.picture_sizes import picture_size
+from taichi_edges.readers.photogrammetry import undistorted
 from taichi_edges.readers.scene_checks import (
     LEAVE_OUT,
     Cameras,
@@ -22,7 +20,10 @@ from taichi_edges.readers.scene_checks import (
     into_unit_cube,
     views_in_sight,
 )
-from taichi_edges.views import Views
+from taichi_edges.views.cameras import OPENGL_TO_OPENCV, Similarity, inside_image, invert_pose, project
+from taichi_edges.views.picture_sizes import picture_size
+from taichi_edges.views.pictures import is_whole
+from taichi_edges.views.views import Views
 
 ORTHONORMAL_TOLERANCE = 1e-3  # largest deviation of R^T R from the identity; files store six digits or more
 TURNED_FROM, TURNED_TO = 0.1, 0.3  # off the centre of the image; of that, off the centre of the turned image
@@ -39,9 +40,6 @@ PER_VIEW = (
     "valid_paths",
     "lenses",
 )
-TAIL_BYTES = 64  # some writers pad the file behind its end marker
-# What a whole file ends with; a decoder alone may fill the missing rows of a truncated file with grey.
-END_MARKERS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
 
 @dataclass(frozen=True)
@@ -322,14 +320,6 @@ def folders_in(folder):
     """The folders in a folder, in words."""
     names = sorted(p.name for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
     return name_some(names, 8) or "no folders"
-
-
-def is_whole(path):
-    """Does the file end as a whole file of its kind ends? Formats without a known end marker pass."""
-    marker, size = END_MARKERS.get(path.suffix.lower()), path.stat().st_size
-    with open(path, "rb") as file:
-        file.seek(max(size - TAIL_BYTES, 0))
-        return size > 0 and (marker is None or marker in file.read())
 
 
 def is_usable(path):

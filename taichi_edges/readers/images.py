@@ -5,17 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_edges.artefacts import digest_file
 from taichi_edges.errors import UserError, name_some
-from taichi_edges.readers.frames import (
-    LEAVE_OUT,
-    TURNED_BY_EXIF,
-    folders_beside,
-    is_usable,
-    is_whole,
-    refuse_views,
-    subset,
-)
+from taichi_edges.files.artefacts import digest_file
+from taichi_edges.readers.frames import LEAVE_OUT, TURNED_BY_EXIF, folders_beside, is_usable, refuse_views, subset
+from taichi_edges.views.pictures import is_whole
 
 MASK_KEEPS = 128  # of 255, from here on
 MOSTLY_EDGES = 0.5  # share of edge pixels from which on the maps must be black on white

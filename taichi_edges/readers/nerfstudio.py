@@ -10,14 +10,14 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from taichi_edges.cameras import OPENGL_TO_OPENCV
 from taichi_edges.errors import UserError
-from taichi_edges.photogrammetry import Lens
 from taichi_edges.readers.companions import companion, edge_paths, mask_paths
 from taichi_edges.readers.frames import Frames, read_json
-from taichi_edges.readers.picture_sizes import picture_size
+from taichi_edges.readers.photogrammetry import Lens
 from taichi_edges.readers.points import read_cloud
 from taichi_edges.readers.scene_box import box_of_cameras, scene_box
+from taichi_edges.views.cameras import OPENGL_TO_OPENCV
+from taichi_edges.views.picture_sizes import picture_size
 
 LISTING = "transforms.json"
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")

@@ -7,14 +7,14 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from taichi_edges.artefacts import digest, digest_file, write_json
 from taichi_edges.errors import UserError, name_some
-from taichi_edges.photogrammetry import colmap_version, known_focal_length, model_files, reconstruct
+from taichi_edges.files.artefacts import digest, digest_file, write_json
 from taichi_edges.readers.colmap import frames_of_model
 from taichi_edges.readers.companions import edge_paths, is_picture, mask_folder, mask_paths
 from taichi_edges.readers.frames import Frames, is_usable
 from taichi_edges.readers.images import read_mask
-from taichi_edges.readers.picture_sizes import picture_size
+from taichi_edges.readers.photogrammetry import colmap_version, known_focal_length, model_files, reconstruct
+from taichi_edges.views.picture_sizes import picture_size
 
 METHOD = 1  # raised when the same photographs give another reconstruction
 FEWEST = 3  # views; fewer show no edge surely

@@ -5,8 +5,8 @@ import os
 
 import numpy as np
 
-from taichi_edges.artefacts import file_state
 from taichi_edges.errors import UserError
+from taichi_edges.files.artefacts import file_state
 
 
 def read_points(path, box):

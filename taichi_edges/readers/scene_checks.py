@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from taichi_edges.cameras import OPENGL_TO_OPENCV, Similarity, inside_image, invert_pose, project
 from taichi_edges.errors import UserError, name_some
+from taichi_edges.views.cameras import OPENGL_TO_OPENCV, Similarity, inside_image, invert_pose, project
 
 LEAST_VIEWS = 3  # two viewing planes always meet: only a third tells an edge from chance
 BOX_GRIDS = (9, 33)  # points along each side of the scene box that are looked for in every view; if in vain, more

@@ -17,13 +17,13 @@ from threading import Lock
 import cv2
 import numpy as np
 
-from taichi_edges.artefacts import digest, digest_file, replacing, write_json
 from taichi_edges.errors import UserError
-from taichi_edges.light import light_of_srgb, srgb_of_light
-from taichi_edges.photogrammetry import Lens, colmap_version, distorted_pixels, undistorted
+from taichi_edges.files.artefacts import digest, digest_file, replacing, write_json
 from taichi_edges.progress import Progress
 from taichi_edges.readers.frames import LEAVE_OUT, is_usable, refuse_views
-from taichi_edges.readers.picture_sizes import picture_size
+from taichi_edges.readers.photogrammetry import Lens, colmap_version, distorted_pixels, undistorted
+from taichi_edges.views.light import light_of_srgb, srgb_of_light
+from taichi_edges.views.picture_sizes import picture_size
 
 METHOD = 1  # raised when the same inputs give other pictures
 FOLDERS = {"image_paths": "images", "edge_paths": "edges", "mask_paths": "masks"}

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taichi_edges.evidence.support import exclusive_support
 from taichi_edges.splatting.gaussians import Gaussians
-from taichi_edges.support import exclusive_support
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from taichi_edges.errors import UserError
+from taichi_edges.evidence.support import exclusive_support
 from taichi_edges.splatting import density
 from taichi_edges.splatting.density import Population
 from taichi_edges.splatting.gaussians import Gaussians, logit
 from taichi_edges.splatting.splatter import GPU_ARCHS, Splatter
-from taichi_edges.support import exclusive_support
 
 SETTLED_PASSES = 2  # over the views; the pixels drawn anew make the loss of a single pass uncertain by 0.7 %
 ESTABLISHED_OPACITY = 0.2  # fainter ones are in no result: the least of the filters

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from taichi_edges.bezier import evaluate_bezier
+from taichi_edges.geometry.bezier import evaluate_bezier
 from taichi_edges.synthetic.profiles import PIECE_FACETS, Path, Profile, Segment, arc, circle, rectangle
 from taichi_edges.synthetic.solids import assemble
 from taichi_edges.synthetic.surfaces import Surface, cap, grid_triangles, lift, wall

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taichi_edges.bezier import evaluate_bezier
+from taichi_edges.geometry.bezier import evaluate_bezier
 
 ARC_PIECE = 45.0  # degrees: a cubic of 45 degrees leaves the true circle by 4.2e-6 of the radius
 PIECE_FACETS = 24  # mesh facets across an arc piece; equal for all radii, so that faces about one axis can meet

@@ -3,11 +3,11 @@
 import cv2
 import numpy as np
 
-from taichi_edges.cameras import project
-from taichi_edges.light import light_of_srgb, srgb_of_light
 from taichi_edges.synthetic.drawing import Imperfections, draw_edge_map
 from taichi_edges.synthetic.visibility import ray_scene, sample_contours, sample_edges, visible_from
-from taichi_edges.views import Views
+from taichi_edges.views.cameras import project
+from taichi_edges.views.light import light_of_srgb, srgb_of_light
+from taichi_edges.views.views import Views
 
 __all__ = ["Imperfections", "render_edge_maps", "render_pictures", "render_views", "ring_cameras"]
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from taichi_edges.edge_set import EdgeSet
+from taichi_edges.geometry.edge_set import EdgeSet
 from taichi_edges.synthetic.profiles import SHARP_ANGLE
 from taichi_edges.synthetic.surfaces import cap, revolved, wall
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from taichi_edges.bezier import evaluate_bezier
+from taichi_edges.geometry.bezier import evaluate_bezier
 
 # A sample is lifted off the surface by so much (world units) before its ray to the camera is cast. It must exceed the
 # distance between exact edge and mesh (CHORD_ERROR, 5e-5) and the rounding of float32 rays (1e-6); it shifts the point

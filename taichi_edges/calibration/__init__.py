@@ -1,0 +1,1 @@
+"""What removes the biases of a detector's maps: shifts, silhouettes that lie outside."""

@@ -1,0 +1,50 @@
+"""The stage `cluster`: from Gaussians to oriented points, each with the edge that it lies on."""
+
+from dataclasses import asdict
+
+import numpy as np
+
+from taichi_edges.errors import UserError
+from taichi_edges.files.artefacts import replacing
+from taichi_edges.views.views import pixel_size, read_views
+
+
+def cluster(run):
+    """`gaussians.ply`, `views.npz` -> `points.ply` (filtered oriented points, input frame) and `clusters.npz`."""
+    from taichi_edges.exporters.point_cloud import write_oriented_points
+    from taichi_edges.files.splats import read_gaussians
+    from taichi_edges.kernels.device import is_running, start_taichi
+    from taichi_edges.points.filtering import FEW_VIEWS, filter_points
+    from taichi_edges.splatting.gaussians import Gaussians
+    from taichi_edges.strokes.assembly import assemble
+    from taichi_edges.strokes.contours import without_contours
+
+    if not is_running(run.arch, run.threads):  # after the training it is
+        start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)
+    views = read_views(run.path("views.npz"))
+    gaussians = Gaussians(*read_gaussians(run.path("gaussians.ply")))
+    means = views.similarity.to_unit(gaussians.means.astype(np.float64))
+    threshold, generator = run.config.train.edge_threshold, np.random.default_rng(run.config.seed)
+    points, directions, explained, counts = filter_points(
+        means, gaussians.directions(), gaussians.opacities, views, run.config.filter, threshold, generator
+    )
+    if len(points) == 0:
+        problem = f"none of {len(means)} Gaussians passed the filters ({_in_words(asdict(counts))})"
+        cure = "train longer, or lower filter.min_opacity or filter.min_support"
+        if run.config.filter.refine and len(views) < FEW_VIEWS * run.config.filter.min_views:
+            seen = f"an edge must be seen in {run.config.filter.min_views:g} views at full strength"
+            cure = f"{len(views)} views are too few, {seen}: take more, or set filter.refine: false"
+        raise UserError(f"{run.path('gaussians.ply')}: {problem}; {cure}")
+    found = assemble(points, directions, run.config.cluster, pixel_size(views))
+    found, contours = without_contours(found, points, directions, explained, views, run.config.filter)
+    labels = found.labels
+    write_oriented_points(run.path("points.ply"), views.similarity.to_input(points), directions, labels)
+    with replacing(run.path("clusters.npz")) as unfinished, open(unfinished, "wb") as file:
+        np.savez_compressed(file, points=points, directions=directions, **asdict(found))
+    found = {"points": len(points), "clusters": int(labels.max() + 1), "unclustered": int((labels < 0).sum())}
+    return {**asdict(counts), **found, "contours": contours}
+
+
+def _in_words(counts):
+    """'5 low opacity, 3 outliers' from a dict of counts, without those that are zero and the number of all."""
+    return ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in counts.items() if n and name != "gaussians")

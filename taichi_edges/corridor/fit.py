@@ -1,0 +1,26 @@
+"""The stage `fit`: a shape for each cluster of points."""
+
+import numpy as np
+
+from taichi_edges.geometry.wireframe import write_wireframe
+from taichi_edges.views.views import read_views
+
+
+def fit(run):
+    """`clusters.npz` -> `edges_fit.json` (input frame): edges that do not meet yet."""
+    from taichi_edges.strokes.assembly import fit_assembly
+
+    views = read_views(run.path("views.npz"))
+    with np.load(run.path("clusters.npz")) as archive:
+        parts = (archive[name] for name in ("points", "labels", "shared", "arcs"))
+        edges, counts = fit_assembly(*parts, run.config.fit)
+    clusters = {kind: counts[kind] for kind in ("line", "curve", "loop", "short", "degenerate")}
+    about = {"frame": "input", "clusters": clusters, "scene": run.config.name, "seed": run.config.seed}
+    write_wireframe(
+        run.path("edges_fit.json"), edges.transformed(views.similarity.to_input, 1.0 / views.similarity.scale), about
+    )
+    if len(edges) == 0:
+        run.progress.warn(f"no edge was found in {sum(clusters.values())} clusters; see the counts in run.json")
+    kinds = {f"{kind}_clusters": count for kind, count in clusters.items()}
+    pieces = edges.edge_set()
+    return {"lines": len(pieces.lines), "curves": len(pieces.curves), **kinds}

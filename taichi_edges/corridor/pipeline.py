@@ -1,0 +1,357 @@
+"""The corridor: which stages there are, what each reads and writes, and when a stage may be skipped.
+
+`run.json` records for every finished stage a fingerprint of all it depended on (settings, input files, seed, threads,
+versions) and the digests of what it wrote. A stage whose fingerprint and outputs still match is skipped; a stage the
+user wants to start after is refused when it is missing or stale.
+
+A stage is a plain function of a Run, in a file of its name beside this one. It returns the facts it found (JSON-able),
+which `run.json` keeps; the fact "files", where there is one, lists what it wrote beyond its artefacts. A stage reads
+only what is on disk, so a resumed run cannot differ from an unbroken one. What takes long to import (SciPy, OpenCV,
+Open3D, Taichi) is imported by the stage that needs it: a run that is up to date, and a mistake in the scene file, shall
+not wait for it.
+"""
+
+import contextlib
+import errno
+import functools
+import os
+import platform
+import resource
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import yaml
+
+import taichi_edges
+from taichi_edges.corridor import cluster, evaluate, export, fit, prepare, refine, sources, train
+from taichi_edges.corridor.findings import FINDINGS
+from taichi_edges.errors import UserError
+from taichi_edges.files.artefacts import (
+    digest,
+    digest_file,
+    locked,
+    read_facts,
+    remove_unfinished,
+    write_json,
+    write_text,
+)
+from taichi_edges.progress import Progress
+
+STAGE_KEYS = {"seconds", "peak_memory_mib", "fingerprint", "inputs", "outputs", "facts"}
+DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR)
+# What the result of any stage may depend on; a stage that uses another package names it.
+PACKAGES = ("taichi", "numpy", "scipy", "opencv-python-headless", "open3d", "open3d-cpu", "onnxruntime")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of the corridor.
+
+    sections: the keys of the scene its result depends on ('a.b' reaches into a section). reads: artefacts of earlier
+    stages. writes: its own. outside: function of the Run that lists the input files it reads beyond those, and raises
+    UserError where the scene names one that is not there. on_device: whether threads and arch matter to its result.
+    packages: those beyond PACKAGES whose version matters to it.
+    """
+
+    function: Callable
+    sections: tuple
+    reads: tuple
+    writes: tuple
+    outside: Callable = lambda run: []
+    on_device: bool = False
+    packages: tuple = ()
+
+
+STAGES = {
+    "prepare": Stage(
+        prepare.prepare,
+        ("source", "calibration", "box", "seed", "train.edge_threshold", "evaluation.held_out"),
+        (),
+        ("views.npz", "held_out.npz"),
+        sources.source_files,
+        packages=("pycolmap",),
+    ),
+    "train": Stage(
+        train.train,
+        ("train", "seed"),
+        ("views.npz",),
+        ("gaussians.ply", "train_log.csv"),
+        sources.seed_files,
+        on_device=True,
+    ),
+    "cluster": Stage(
+        cluster.cluster,
+        ("filter", "cluster", "train.edge_threshold", "seed"),
+        ("gaussians.ply", "views.npz"),
+        ("points.ply", "clusters.npz"),
+        on_device=True,
+    ),
+    "fit": Stage(fit.fit, ("fit", "name", "seed"), ("clusters.npz", "views.npz"), ("edges_fit.json",)),
+    "refine": Stage(
+        refine.refine, ("refine", "seed"), ("edges_fit.json", "views.npz"), ("edges.json",), on_device=True
+    ),
+    "evaluate": Stage(
+        evaluate.evaluate,
+        ("evaluation",),
+        ("edges.json", "views.npz", "held_out.npz"),
+        ("metrics.json", "metrics.csv"),
+        sources.truth_files,
+    ),
+    "export": Stage(
+        export.export,
+        (),
+        ("edges.json", "views.npz"),
+        ("overlays.png",),
+        sources.picture_files,
+        packages=("ezdxf",),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """One scene on its way through the corridor.
+
+    folder: where all artefacts go. data_root: where relative paths of the scene start, or None.
+    """
+
+    config: object
+    folder: Path
+    data_root: Path | None = None
+    threads: int = 1
+    arch: str = "cpu"
+    progress: Progress = field(default_factory=Progress)
+
+    def path(self, name):
+        """An artefact's path."""
+        return self.folder / name
+
+    @property
+    def kernel_cache(self):
+        """Where compiled Taichi kernels are kept between runs: a folder of our own for each pair of versions."""
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        return home / "taichi_edges" / f"kernels-{taichi_edges.__version__}-taichi-{version('taichi')}"
+
+    def data_path(self, text, key):
+        """A path of the scene: absolute, or relative to the data root. UserError where it does not exist."""
+        path = expand(text, key)
+        if not path.is_absolute():
+            if self.data_root is None:
+                problem = f"{text} is relative to the data root, and there is none"
+                raise UserError(f"{key}: {problem}; give --data FOLDER or set TAICHI_EDGES_DATA")
+            path = self.data_root / path
+        if not path.exists():
+            raise UserError(f"{key}: {path} does not exist; correct {key}, --data or TAICHI_EDGES_DATA")
+        return path
+
+
+def expand(text, origin):
+    """A path as the user wrote it, with `~` replaced; `origin` is where it was written, for the message."""
+    try:
+        return Path(text).expanduser()
+    except RuntimeError as error:
+        raise UserError(f"{origin}: {text}: '~' and what follows it name no user; write the path out") from error
+
+
+def run_stages(run, start=None, until=None):
+    """Run the corridor. start: this stage and those after it run anew; until: stop after this one.
+
+    Without `start`, every stage that is up to date is skipped. Returns the record that `run.json` holds; its key "ran"
+    lists the stages that were not skipped.
+    """
+    names = list(STAGES)
+    first = names.index(start) if start else 0
+    last = names.index(until) if until else len(names) - 1
+    if first > last:
+        raise UserError(f"--stage {start} comes after --until {until}; the order is {' '.join(names)}")
+    for name in names[: last + 1]:
+        STAGES[name].outside(run)  # a mistyped path must not come to light after the training
+    with _own_folder(run):
+        record = _open_record(run)
+        for name in names[:first]:
+            _refuse_stale(run, record, name)
+        for name in names[first : last + 1]:
+            _run_stage(run, record, name, force=start is not None)
+    return record
+
+
+@contextlib.contextmanager
+def _own_folder(run):
+    """The run's folder, ours alone; UserError where it cannot be."""
+    with contextlib.ExitStack() as stack:
+        with _explained_to_be_unwritable(run):
+            stack.enter_context(locked(run.folder))
+        yield
+
+
+@contextlib.contextmanager
+def _explained_to_be_unwritable(run):
+    try:
+        yield
+    except OSError as error:
+        problem = f"cannot be written to ({error.strerror})"
+        raise UserError(f"{run.folder}: {problem}; choose another folder with --out") from error
+
+
+def _open_record(run):
+    """The run's record, with what is known before any stage: the resolved scene, versions, machine."""
+    scene = run.config.model_dump()
+    with _explained_to_be_unwritable(run):
+        remove_unfinished(run.folder)
+        write_text(run.path("scene.yaml"), yaml.safe_dump(scene, sort_keys=False))
+    old = read_facts(run.path("run.json")).get("stages")
+    known = old.items() if isinstance(old, dict) else ()
+    return {
+        "taichi_edges": taichi_edges.__version__,
+        "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "scene": scene,
+        "threads": run.threads,
+        "arch": run.arch,
+        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        "python": platform.python_version(),
+        "versions": _versions(tuple(package for stage in STAGES.values() for package in stage.packages)),
+        "ran": [],
+        "stages": {name: stage for name, stage in known if isinstance(stage, dict) and set(stage) >= STAGE_KEYS},
+    }
+
+
+@functools.cache
+def _versions(more=()):
+    """The versions of ourselves, of PACKAGES and of more, by name; without those that are not installed."""
+    found = {"taichi_edges": taichi_edges.__version__}
+    for package in (*PACKAGES, *more):
+        with contextlib.suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
+
+
+def _settings(run, stage):
+    """The values a stage depends on, by key."""
+    values = {}
+    for section in stage.sections:
+        value = run.config
+        for name in section.split("."):
+            value = getattr(value, name)
+        values[section] = value.model_dump() if hasattr(value, "model_dump") else value
+    if stage.on_device:
+        values["threads"], values["arch"] = run.threads, run.arch
+    return values
+
+
+def _inputs(run, stage):
+    """What the stage depends on: its settings, the versions, and the digest of every file it reads."""
+    files = {artefact: digest_file(run.path(artefact)) for artefact in stage.reads}
+    files |= {_label(run, path): digest_file(path) for path in stage.outside(run) if path.exists()}
+    return {"settings": _settings(run, stage), "files": files, "versions": _versions(stage.packages)}
+
+
+def _label(run, path):
+    """A file's path, relative to the run's folder where it lies in it: a folder that was moved is not stale."""
+    return str(path.relative_to(run.folder)) if path.is_relative_to(run.folder) else str(path)
+
+
+def _why_stale(run, record, name):
+    """None where a stage is up to date, else (artefact, why it is not what the stage would write now)."""
+    stage, known = STAGES[name], record["stages"].get(name)
+    missing = [artefact for artefact in stage.writes if not run.path(artefact).exists()]
+    if known is None or missing:
+        return (*missing, *stage.writes)[0], f"not there yet, the {name} stage has not finished"
+    unread = [artefact for artefact in stage.reads if not run.path(artefact).exists()]
+    if unread:
+        return stage.writes[0], f"stale: {unread[0]}, which the {name} stage reads, is gone"
+    inputs = _inputs(run, stage)
+    if known["fingerprint"] != digest(inputs):
+        changes = _changes(known["inputs"], inputs)
+        more = f" and {len(changes) - 3} more" if len(changes) > 3 else ""
+        return stage.writes[0], f"stale: {'; '.join(changes[:3]) or 'its inputs have changed'}{more}"
+    for artefact, digest_then in known["outputs"].items():
+        if not run.path(artefact).exists():
+            return artefact, f"is gone since the {name} stage wrote it"
+        if digest_file(run.path(artefact)) != digest_then:
+            return artefact, f"is not the file that the {name} stage wrote"
+    return None
+
+
+def _refuse_stale(run, record, name):
+    """UserError unless the stage, one before those asked for, is up to date."""
+    stale = _why_stale(run, record, name)
+    if stale:
+        artefact, why = stale
+        raise UserError(f"{run.path(artefact)}: {why}; run again without --stage, or with --stage {name}")
+
+
+def _changes(old, new):
+    """What differs between two `_inputs`: 'train.epochs was 500, is now 100', 'views.npz has changed'."""
+    changes = _changed_values(old.get("settings", {}), new["settings"])
+    before, now = old.get("files", {}), new["files"]
+    for path in [*now, *(path for path in before if path not in now)]:
+        if before.get(path) != now.get(path):
+            what = "has changed" if path in before and path in now else "is new" if path in now else "is gone"
+            changes.append(f"{path} {what}")
+    return changes + _changed_values(old.get("versions", {}), new["versions"], "the version of ")
+
+
+def _changed_values(old, new, prefix=""):
+    """'train.epochs was 500, is now 100' for every value that differs between two nested dicts."""
+    found = []
+    for key in [*new, *(key for key in old if key not in new)]:
+        before, now = old.get(key), new.get(key)
+        if isinstance(before, dict) and isinstance(now, dict):
+            found += _changed_values(before, now, f"{prefix}{key}.")
+        elif key not in old or key not in new:
+            found.append(f"{prefix}{key} is {'new' if key in new else 'gone'}")
+        elif before != now:
+            found.append(f"{prefix}{key} was {before}, is now {now}")
+    return found
+
+
+def _run_stage(run, record, name, force):
+    """Run one stage, or skip it where it is up to date; keep the record on disk."""
+    stage, known = STAGES[name], record["stages"].get(name)
+    stale = _why_stale(run, record, name)
+    if not force and not stale:
+        run.progress.say(f"{name}: up to date ({known['seconds']:.1f} s when it ran)")
+        return
+    run.progress.say(f"{name} again ({stale[0]}: {stale[1]})" if known and stale else f"{name} ...")
+    _reset_peak_memory()
+    started = time.perf_counter()
+    try:
+        inputs = _inputs(run, stage)
+        facts = stage.function(run)
+        outputs = [*stage.writes, *facts.get("files", [])]
+        record["stages"][name] = {
+            "seconds": round(time.perf_counter() - started, 3),
+            "peak_memory_mib": round(_peak_memory_mib(), 1),
+            "fingerprint": digest(inputs),
+            "inputs": inputs,
+            "outputs": {artefact: digest_file(run.path(artefact)) for artefact in outputs},
+            "facts": facts,
+        }
+        record["ran"].append(name)
+        write_json(run.path("run.json"), record)
+    except OSError as error:
+        if error.errno not in DISK_TROUBLE:
+            raise
+        problem = f"{error.strerror} in the {name} stage"
+        raise UserError(f"{error.filename or run.folder}: {problem}; put that right and repeat the command") from error
+    run.progress.say(f"{name}: {FINDINGS[name](facts)} ({record['stages'][name]['seconds']:.1f} s)")
+
+
+def _reset_peak_memory():
+    """Start the peak anew (Linux; elsewhere the peak is that of the whole process so far)."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def _peak_memory_mib():
+    """Peak resident memory in MiB since the last reset."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024 * 1024 if platform.system() == "Darwin" else 1024)

@@ -1,0 +1,75 @@
+"""The stage `train`: Gaussians, optimised until they lie on edges."""
+
+import numpy as np
+
+from taichi_edges.corridor.findings import WRONG_CAMERAS
+from taichi_edges.files.artefacts import write_csv
+from taichi_edges.views.views import read_views
+
+
+def train(run):
+    """`views.npz` -> `gaussians.ply` (input frame) and `train_log.csv`."""
+    from taichi_edges.files.splats import write_gaussians
+    from taichi_edges.kernels.device import start_taichi
+    from taichi_edges.splatting.training import Training
+
+    config, views = run.config.train, read_views(run.path("views.npz"))
+    generator = np.random.default_rng(run.config.seed)
+    start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)
+    start = start_of_training(run, views, generator)
+    training = Training(views, config, generator, run.threads, run.arch)
+    gaussians, records = training.run(start, run.progress)
+    rows = [("step", "seconds", "loss", "gaussians")]
+    rows += [(r.step, f"{r.seconds:.3f}", f"{r.loss:.6f}", r.gaussians) for r in records]
+    write_csv(run.path("train_log.csv"), rows)
+    similarity = views.similarity
+    write_gaussians(
+        run.path("gaussians.ply"),
+        similarity.to_input(gaussians.means).astype(np.float32),
+        gaussians.log_scales - np.float32(np.log(similarity.scale)),
+        gaussians.quaternions,
+        gaussians.opacity_logits,
+    )
+    loss = records[-1].loss if np.isfinite(records[-1].loss) else None  # no step may have measured it alone
+    return {"gaussians": len(gaussians), "view_steps": records[-1].step, "final_loss": loss}
+
+
+def start_of_training(run, views, generator):
+    """The Gaussians that training starts from, as `train.seeds` says."""
+    from taichi_edges.files.ply import read_vertices, stack_fields
+    from taichi_edges.seeding.starts import LEAST_VOTED, given_points, random_points, voted_gaussians
+    from taichi_edges.splatting.gaussians import start_gaussians
+
+    config = run.config.train
+    seeds = config.seeds
+    if seeds in ("votes", "sweep"):
+        found, seeds = _swept(run, views) if seeds == "sweep" else (None, seeds)
+        if seeds == "votes":
+            found = voted_gaussians(views, config.edge_threshold, config.gaussians, config.initial_opacity, generator)
+        if found is not None:
+            return found
+        seeds = "points" if run.path("seeds.ply").is_file() else "random"
+        instead = {"points": "the given points", "random": "random points"}[seeds]
+        found = f"the views agree on an edge in fewer than {LEAST_VOTED} places"
+        run.progress.warn(f"{found}: {WRONG_CAMERAS}; the training starts from {instead} instead")
+    if seeds == "random" or not run.path("seeds.ply").is_file():
+        points = random_points(config.gaussians, views.box, generator)
+    else:
+        given = stack_fields(read_vertices(run.path("seeds.ply"), ("x", "y", "z")), ("x", "y", "z"))
+        points = given_points(views.similarity.to_unit(given.astype(np.float64)), config.gaussians, generator)
+        if seeds == "auto":  # structure from motion finds few points where there is no texture
+            more = random_points(config.gaussians - len(points), views.box, generator)
+            points = np.concatenate([points, more])
+    return start_gaussians(points, generator, config.initial_scale, config.initial_opacity)
+
+
+def _swept(run, views):
+    """Gaussians by sweeping, None where views agree in too few places; and the seeds to use: 'votes' if none can be."""
+    from taichi_edges.seeding.sweeping import TOGETHER, can_sweep, swept_gaussians
+
+    found = swept_gaussians(views, run.config.train.gaussians, run.config.train.initial_opacity, run.progress)
+    if found is not None or can_sweep(views):
+        return found, "sweep"
+    problem = f"fewer than {TOGETHER + 1} views see the same, and the sweep needs so many"
+    run.progress.warn(f"{problem}: take more pictures, each from near the one before; the training starts from votes")
+    return None, "votes"

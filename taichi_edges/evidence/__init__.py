@@ -1,0 +1,1 @@
+"""What the images say about points and edges."""

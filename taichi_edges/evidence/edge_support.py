@@ -1,0 +1,296 @@
+"""What the edgels of all views say about edges whose shapes are known.
+
+The nearest edge owns the edgel: an edge gets no support from its neighbour's edgels. That a view has no edgel where an
+edge projects says nothing against it, for it may be hidden there; that the edgels near it are off it does.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import gammainc
+
+from taichi_edges.evidence.edgel_matching import MOST_SINE
+from taichi_edges.evidence.explaining import BEST_SUPPORTED, NOISE_PER_MEDIAN, TIGHT_NOISES, TIGHT_PX
+from taichi_edges.geometry.wireframe import Evidence
+
+SPACING_PX = 0.5  # of the samples of an edge; edgels are about 1 px apart, so that hardly one of them is missed
+MATCH_PX = 1.5  # an edgel within this distance is an edge's, if it is nobody else's
+TIE_PX = 0.1  # beyond its ends an edge must be nearer to an edgel than its neighbour is, by so much
+CHORDS = 64  # for each cubic: where places at equal distances along a shape are looked for
+CORE, CORE_ROUNDS = 3.0, 8  # standard deviations of the core; rounds in which it is found
+TIE_NOISES = 3.0  # of the noise: what cannot make the worse of two edges the nearer one
+ABOUT, MOST_ABOUT_PX = 6.0, 4.0  # an edgel within so many times the distance at which it is on an edge is about it
+PLANES = 2  # those of two views always meet
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Places at equal distances along each of some shapes, in the middle of the stretches they stand for.
+
+    points, directions: (n, 3), unit vectors. edges: (n,) index of the shape. parameters: (n,) on it, see `shapes`.
+    lengths: (n,) of the stretches. starts: (E + 1,) those of shape e are starts[e] .. starts[e + 1] - 1.
+    """
+
+    points: np.ndarray
+    directions: np.ndarray
+    edges: np.ndarray
+    parameters: np.ndarray
+    lengths: np.ndarray
+    starts: np.ndarray
+
+    @staticmethod
+    def along(shapes, spacing):
+        """Samples of shapes, about `spacing` apart (units of their frame), one for each shape at least."""
+        parameters = [spaced(shape, spacing) for shape in shapes]
+        counts = np.array([len(some) for some in parameters], dtype=np.int64)
+        pairs = list(zip(shapes, parameters, strict=True))
+        return Samples(
+            np.concatenate([np.zeros((0, 3)), *(shape.at(some) for shape, some in pairs)]),
+            np.concatenate([np.zeros((0, 3)), *(shape.tangents(some) for shape, some in pairs)]),
+            np.repeat(np.arange(len(shapes)), counts),
+            np.concatenate([np.zeros(0), *parameters]),
+            np.repeat(np.array([shape.length for shape in shapes]) / np.maximum(counts, 1), counts),
+            np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        )
+
+    def __len__(self):
+        return len(self.points)
+
+    def of(self, edge):
+        """Slice of the samples of one shape."""
+        return slice(int(self.starts[edge]), int(self.starts[edge + 1]))
+
+    def sums(self, values):
+        """(E,) or (E, k) sums of values (n,) or (n, k) over the samples of each shape."""
+        totals = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0, dtype=np.float64)])
+        return totals[self.starts[1:]] - totals[self.starts[:-1]]
+
+
+def spaced(shape, spacing):
+    """(n,) parameters in the middles of stretches of equal length, about `spacing` long."""
+    count = max(int(round(shape.length / spacing)), 1)
+    middles = (np.arange(count) + 0.5) / count
+    if shape.kind in ("line", "arc", "circle"):
+        return middles
+    grid = np.linspace(0.0, 1.0, CHORDS * len(shape.cubics()) + 1)
+    travelled = np.linalg.norm(np.diff(shape.at(grid), axis=0), axis=1).cumsum()
+    return np.interp(middles * travelled[-1], np.concatenate([[0.0], travelled]), grid)
+
+
+@dataclass(frozen=True)
+class Claims:
+    """Which of some edges each edgel is nearest to.
+
+    owners: (e,) index of the edge, -1 where none is within MATCH_PX. distances: (e,) px from the owner. rivals: (e,) px
+    from the nearest edge that is not the owner. Distances are infinite where there is no such edge; a weak edge's count
+    as greater, see `support_of`.
+    """
+
+    owners: np.ndarray
+    distances: np.ndarray
+    rivals: np.ndarray
+
+    @staticmethod
+    def of(count, edgels, edges, distances):
+        """From pairs of edgel and edge: edgels, edges, distances (p,). count: of edgels. Of ties the first wins."""
+        owners, nearest, rivals = np.full(count, np.iinfo(np.int64).max), np.full(count, np.inf), np.full(count, np.inf)
+        np.minimum.at(nearest, edgels, distances)
+        first = distances == nearest[edgels]
+        np.minimum.at(owners, edgels[first], edges[first])
+        owners[np.isinf(nearest)] = -1
+        others = edges != owners[edgels]
+        np.minimum.at(rivals, edgels[others], distances[others])
+        return Claims(owners, nearest, rivals)
+
+    def beside(self, edges, edgels=slice(None)):
+        """(e,) px from the nearest edge other than a given one, or than (e,) `edges`; of some edgels only, if given."""
+        return np.where(self.owners[edgels] == edges, self.rivals[edgels], self.distances[edgels])
+
+
+@dataclass(frozen=True)
+class Support:
+    """The edgels of all views that are matched by the samples of some edges and owned by these.
+
+    samples: Samples. edgels: (n, V) index, -1 where there is none. residuals: (n, V) px. weights: (n, V) strength of
+    the edgel times closeness, that of Geman and McClure at the scale of the matching; 0 where there is none. claims:
+    Claims. chance: sum of the weights that a place would have by chance. least_views: that must show an edge, each
+    counted by its weight.
+    """
+
+    samples: Samples
+    edgels: np.ndarray
+    residuals: np.ndarray
+    weights: np.ndarray
+    claims: Claims
+    chance: float
+    least_views: float
+
+    @cached_property
+    def views(self):
+        """(n,) number of views that support each sample, each counted by its weight."""
+        return self.weights.sum(axis=1)
+
+    @cached_property
+    def certainty(self):
+        """(n,) that so many views do not agree by chance, 0 to 1.
+
+        Two viewing planes always meet. How many more do by chance is a matter of Poisson's distribution.
+        """
+        beyond = self.views - PLANES
+        return np.where(beyond > 0, 1.0 - gammainc(np.maximum(beyond, 1e-9), self.chance), 0.0)
+
+    @cached_property
+    def noise_px(self):
+        """Standard deviation of the residuals of the best-supported fifth of the samples, px.
+
+        Of their core: close to other edges the tails are these.
+        """
+        if not len(self.samples):
+            return 0.0
+        counts = (self.edgels >= 0).sum(axis=1)  # not the weights, which would choose small residuals
+        best = counts >= np.quantile(counts, 1 - BEST_SUPPORTED)
+        residuals = np.abs(self.residuals[best][self.edgels[best] >= 0])
+        noise = MATCH_PX
+        for _ in range(CORE_ROUNDS if len(residuals) else 0):
+            noise = float(NOISE_PER_MEDIAN * np.median(residuals[residuals <= max(CORE * noise, residuals.min())]))
+        return noise if len(residuals) else 0.0
+
+    @cached_property
+    def supported_lengths(self):
+        """(E,) length that `least_views` see, each counted by its weight."""
+        return self.samples.sums(self.samples.lengths * (self.views >= self.least_views))
+
+    @cached_property
+    def residual_px(self):
+        """(E,) root mean square distance of the edgels of each edge, px; 0 where there are none."""
+        found = (self.edgels >= 0).sum(axis=1)
+        squares = np.where(self.edgels >= 0, self.residuals.astype(np.float64) ** 2, 0.0).sum(axis=1)
+        return np.sqrt(self.samples.sums(squares) / np.maximum(self.samples.sums(found), 1))
+
+
+def support_of(matching, shapes, radius=MATCH_PX):
+    """The Support of shapes. matching: EdgelMatching. radius: px, of the matches.
+
+    The noise can make an edgel nearer to the wrong one of two edges, so an edge with fewer views on its length than the
+    best one counts as farther away, by up to TIE_NOISES times the noise.
+    """
+    samples = Samples.along(shapes, SPACING_PX * matching.pixel)
+    edgels, residuals = _matches(matching, samples.points, samples.directions, radius)
+    nearest = _owned(matching, samples, edgels, residuals, np.zeros(len(shapes)))
+    strengths = samples.sums(nearest.views) / np.maximum(np.diff(samples.starts), 1)
+    handicaps = TIE_NOISES * nearest.noise_px * (1.0 - strengths / max(strengths.max(initial=0.0), 1e-300))
+    return _owned(matching, samples, edgels, residuals, handicaps)
+
+
+def _owned(matching, samples, edgels, residuals, handicaps):
+    """The Support of samples with all their matches. handicaps: (E,) px by which edges count as farther away."""
+    at, view = np.nonzero(edgels >= 0)
+    found, edges = edgels[at, view], samples.edges[at]
+    claims = Claims.of(len(matching.edgels), found, edges, np.abs(residuals[at, view]) + handicaps[edges])
+    lost, edgels = claims.owners[found] != edges, edgels.copy()
+    edgels[at[lost], view[lost]] = -1
+    weights = _weights(matching, edgels, residuals)
+    return Support(samples, edgels, residuals, weights, claims, chance_weight(matching), matching.least_views)
+
+
+def evidence_of(support):
+    """One Evidence for each edge of a Support: what the views say when every edgel supports one edge alone.
+
+    `confidence` is the share of the length that is not there by chance (`Support.certainty`), times how well its edgels
+    lie on it: 1 as far as the noise explains their distances, their mean square over that beyond.
+    """
+    samples, lengths = support.samples, support.samples.lengths
+    total = np.maximum(samples.sums(lengths), 1e-300)
+    seeing = (samples.sums(lengths[:, None] * (support.edgels >= 0)) >= 0.5 * total[:, None]).sum(axis=1)
+    tight = max(TIGHT_PX, TIGHT_NOISES * support.noise_px)
+    lying = (tight / np.maximum(support.residual_px, tight)) ** 2
+    confidence = samples.sums(lengths * support.certainty) / total * lying
+    columns = zip(seeing, support.supported_lengths, support.residual_px, confidence, strict=True)
+    return [Evidence(int(views), *map(float, rest)) for views, *rest in columns]
+
+
+def steadiness(matching, support):
+    """(E,) share of the edgels about each edge that lie on it, of those that no other edge owns.
+
+    An edge stays where it is as the viewpoint moves. The occluding contour of a smooth surface leaves any line in
+    space, so that its edgels lie all around. matching: EdgelMatching. support: Support of the edges.
+    """
+    samples, tight = support.samples, max(TIGHT_PX, TIGHT_NOISES * support.noise_px)
+    about = min(ABOUT * tight, MOST_ABOUT_PX)
+    views = slice(0, matching.edgels.view_count)
+    edgels, residuals, _ = matching.matches(samples.points, samples.directions, views, about)
+    at, view = np.nonzero(edgels >= 0)
+    owners = support.claims.owners[edgels[at, view]]
+    mine = (owners < 0) | (owners == samples.edges[at])
+    on = mine & (np.abs(residuals[at, view]) <= tight)
+    numbers, count = samples.edges[at], len(samples.starts) - 1
+    return np.bincount(numbers[on], minlength=count) / np.maximum(np.bincount(numbers[mine], minlength=count), 1)
+
+
+def support_share(matching, support):
+    """(E,) number of views that support each edge, each counted by its weight, of those that have it in their image."""
+    samples, views = support.samples, slice(0, matching.edgels.view_count)
+    inside = matching.matches(samples.points, samples.directions, views, MATCH_PX)[2].sum(axis=1)
+    return samples.sums(support.views) / np.maximum(samples.sums(inside), 1)
+
+
+def claims_of(matching, shapes):
+    """The Claims of shapes, for `support_along`. matching: EdgelMatching."""
+    return support_of(matching, shapes).claims
+
+
+def support_along(matching, shape, parameters, claims=None, own=-1):
+    """How many views support places on a shape or beyond its ends, each counted by its weight, see `Support`. (n,)
+
+    parameters: (n,) of the places. claims: Claims of all edges, whose edgels do not count unless they are this shape's
+    or farther from all others than from it. own: the index of this shape among those, if it is one of them.
+    """
+    return support_of_places(matching, [(shape, parameters)], claims, [own])[0]
+
+
+def support_of_places(matching, places, claims=None, owns=()):
+    """`support_along` for many shapes at once. places: [(shape, parameters)]. owns: the index of each of the shapes.
+
+    A kernel takes as long to start as to look up some hundred places.
+    """
+    if not places:
+        return []
+    points = np.concatenate([shape.at(parameters) for shape, parameters in places])
+    directions = np.concatenate([shape.tangents(parameters) for shape, parameters in places])
+    counts = np.array([len(parameters) for _, parameters in places])
+    edgels, residuals = _matches(matching, points, directions, MATCH_PX)
+    if claims is not None:
+        at, view = np.nonzero(edgels >= 0)
+        others = claims.beside(np.repeat(owns, counts)[at], edgels[at, view])
+        lost = np.abs(residuals[at, view]) + TIE_PX >= others
+        edgels[at[lost], view[lost]] = -1
+    views = _weights(matching, edgels, residuals).sum(axis=1)
+    return np.split(views, np.cumsum(counts)[:-1])
+
+
+def chance_weight(matching):
+    """Sum of the weights, over all views, of the edgels that a random place with a random direction has.
+
+    From how densely the edgels fill the part of each image where there are any, a pixel of an edge each.
+    """
+    total = 0.0
+    width = 0.5 * np.pi * matching.scale_px  # integral of Geman and McClure's weight over the distance
+    turned = 2 * np.arcsin(MOST_SINE) / np.pi  # share of the directions that an edgel agrees with
+    for strengths, area in matching.densities:
+        total += float(strengths * width * turned / area)
+    return total
+
+
+def _matches(matching, points, directions, radius):
+    """(n, V) edgels, -1 where there is none within so many px, and residuals of places in all views."""
+    count = matching.edgels.view_count
+    edgels, residuals, _ = matching.matches(points, directions, slice(0, count), radius)
+    return edgels, residuals
+
+
+def _weights(matching, edgels, residuals):
+    """(n, V) strength times closeness of matched edgels, 0 where there is none."""
+    weights, at = np.zeros(edgels.shape, np.float32), edgels >= 0
+    weights[at] = matching.edgels.strengths[edgels[at]] / (1.0 + (residuals[at] / matching.scale_px) ** 2) ** 2
+    return weights

@@ -1,0 +1,132 @@
+"""Files are written under a temporary name and renamed, so a killed run never leaves half a file under a final name."""
+
+import contextlib
+import csv
+import errno
+import fcntl
+import functools
+import hashlib
+import io
+import json
+import os
+from pathlib import Path
+
+from taichi_edges.errors import UserError
+
+LOCK = ".lock"  # in the folder of a run, with the number of the process that writes there
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # of file systems that know none
+
+
+@contextlib.contextmanager
+def replacing(path):
+    """A temporary path beside `path` (same suffix) that takes its place when the block ends without an error."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{path.suffix}")
+    try:
+        yield unfinished
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def locked(folder):
+    """Nobody else writes into `folder` meanwhile; UserError where another run does so now.
+
+    The system gives the lock up when its process ends, however it ends. The file stays: were it removed, a third
+    process might lock a new one beside a second that still holds the old.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / LOCK, "a+", encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            file.seek(0)
+            owner = file.read().strip() or "unknown"
+            problem = f"another run, process {owner}, is writing into this folder"
+            raise UserError(f"{folder}: {problem}; wait for it, or choose another folder with --out") from error
+        except OSError as error:
+            if error.errno not in NO_LOCKS:
+                raise
+        file.truncate(0)
+        file.write(f"{os.getpid()}\n")
+        file.flush()
+        try:
+            yield
+        finally:
+            file.truncate(0)
+
+
+def remove_unfinished(folder):
+    """Delete the temporary files that a killed run has left below `folder`; those of a living process stay."""
+    for path in Path(folder).rglob(".*.unfinished*"):
+        process = path.name.partition(".unfinished")[0].rpartition(".")[2]
+        if process.isdigit() and not _is_alive(int(process)):
+            path.unlink(missing_ok=True)
+
+
+def _is_alive(process):
+    """Is there a process of this number? Our own does not count: what it writes now is not there yet."""
+    if process == os.getpid():
+        return False
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True  # it belongs to someone else
+    return True
+
+
+def write_text(path, text):
+    """Write a text file, all of it or nothing."""
+    with replacing(path) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
+    return Path(path)
+
+
+def write_json(path, content):
+    """Write JSON, all of it or nothing; keys in the order given, floats with all their digits."""
+    return write_text(path, json.dumps(content, indent=1) + "\n")
+
+
+def file_state(path):
+    """What changes when a file is written anew, found without reading it: the key of what is remembered about it."""
+    status = os.stat(path)
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def digest_file(path):
+    """A short hash of a file's bytes; a file that several stages read is hashed once."""
+    return _digest_of(os.fspath(path), file_state(path))
+
+
+@functools.lru_cache(maxsize=1 << 14)
+def _digest_of(path, _state):
+    hasher = hashlib.blake2b(digest_size=16)
+    with open(path, "rb") as file:
+        while block := file.read(1 << 20):
+            hasher.update(block)
+    return hasher.hexdigest()
+
+
+def digest(content):
+    """A short hash of anything JSON can hold."""
+    text = json.dumps(content, sort_keys=True, default=str)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def write_csv(path, rows):
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    write_text(path, text.getvalue())
+
+
+def read_facts(path):
+    """A JSON artefact as a dict; {} where it is not there or damaged (then the stage runs again)."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}

@@ -1,0 +1,1 @@
+"""Which shape is it? Lines, arcs, ellipses, chains of cubics through points. NumPy in, NumPy out."""

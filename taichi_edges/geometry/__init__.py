@@ -1,0 +1,1 @@
+"""The parametric edges themselves: shapes, sets of edges, the wireframe."""

@@ -1,0 +1,28 @@
+"""The edgels of all views in a grid of cells, for look-ups by kernels."""
+
+import numpy as np
+
+from taichi_edges.kernels.device import upload
+
+CELL = 8  # px; side of the cells in which edgels are looked up, at least the largest radius
+
+
+class EdgelGrid:
+    """The edgels of all views in cells of CELL x CELL pixels, for look-ups by kernels.
+
+    starts: (V * rows * columns + 1,) int32, where each cell begins in `elements` (n, 4): u, v and the unit normal.
+    strengths: (n,) float32 of the elements. order: (n + 1,) int32, the index in Edgels of each element, then -1 for
+    none. rows, columns: cells in a view.
+    """
+
+    def __init__(self, edgels, height, width):
+        self.rows, self.columns = -(-height // CELL), -(-width // CELL)
+        inside = np.clip(np.floor(edgels.points / CELL).astype(np.int64), 0, [self.columns - 1, self.rows - 1])
+        cells = (edgels.views * self.rows + inside[:, 1]) * self.columns + inside[:, 0]
+        order = np.argsort(cells, kind="stable")
+        counts = np.bincount(cells, minlength=edgels.view_count * self.rows * self.columns)
+        self.starts = upload(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32))
+        elements = np.concatenate([edgels.points, edgels.normals], axis=1)[order]
+        self.elements = upload(elements.astype(np.float32))
+        self.strengths = upload(edgels.strengths[order].astype(np.float32))
+        self.order = np.append(order.astype(np.int32), np.int32(-1))

@@ -1,0 +1,1 @@
+"""Which trained points to trust, and those that continue them."""

@@ -1,0 +1,154 @@
+"""From trained Gaussians to oriented points: which centres are trusted (paper 3.3 and release), and where they belong.
+
+With `filter.refine` a centre is a first guess. It moves to where the viewing planes of its edgels meet, must explain
+edgels that nothing else explains, and must stay on them as the viewpoint moves. What edgels are left over are voted on
+once more, for edges seen in few views; and all is grown along its tangents.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from taichi_edges.evidence.support import exclusive_support
+
+AROUND = 9  # points, itself included, over which the steadiness of a point is a median
+CONTINUED = 0.5  # views that may be fewer where an edge goes on
+# An edge that fewer views see than so many times the least must be seen from different directions: neighbouring views
+# see an occluding contour in one place as well.
+FEW_VIEWS = 2.0
+RARE = 0.8  # of a harvested point's support, which those that continue it need
+HARVEST_KEEP = 0.06  # share of the views that must see one of the edges left over
+
+
+@dataclass(frozen=True)
+class FilterCounts:
+    """How many Gaussians came in, how many points each filter took away, and how many were found beyond them."""
+
+    gaussians: int
+    low_opacity: int
+    low_support: int
+    unsteady: int = 0
+    harvested: int = 0
+    grown: int = 0
+    outliers: int = 0
+
+
+def filter_points(means, directions, opacities, views, config, edge_threshold, generator):
+    """The centres that are opaque, supported by the edge maps and not isolated; refined if the scene wants that.
+
+    means: (n, 3) unit cube. directions: (n, 3) unit vectors. opacities: (n,). config: the scene's `filter` section.
+    generator: numpy.random.Generator, for what is left to chance in the harvest. ti.init must have been called.
+    Returns points (m, 3) float64, directions (m, 3) float64, what edgels say about them (Explained; None where they are
+    not refined), and FilterCounts.
+    """
+    opaque = np.asarray(opacities) >= config.min_opacity
+    points, directions = (np.asarray(array, dtype=np.float64)[opaque] for array in (means, directions))
+    if config.refine:
+        found = refined_points(points, directions, views, config, edge_threshold, generator)
+        points, directions, explained, counts = found
+    else:
+        on_edges = _on_edge_pixels(points, views, config.min_support, edge_threshold)
+        points, directions, counts = points[on_edges], directions[on_edges], {"low_support": int((~on_edges).sum())}
+        explained = None
+    inliers = statistical_inliers(points, config.outlier_neighbors, config.outlier_deviations)
+    counts = FilterCounts(
+        gaussians=len(opaque),
+        low_opacity=int((~opaque).sum()),
+        **counts,
+        outliers=len(points) - len(inliers),
+    )
+    explained = explained and explained.keep(inliers)
+    return points[inliers], directions[inliers], explained, counts
+
+
+def _on_edge_pixels(points, views, least, edge_threshold):
+    """(n,) bool: which points fall on edge pixels of their own in this share of the views that could see them.
+
+    Those are the views that have a point in front of the camera and inside the image; that an edge is hidden in many of
+    them is why the share asked for is small.
+    """
+    support = exclusive_support(views, points, edge_threshold)
+    return (support >= least) & (support > 0)
+
+
+def refined_points(points, directions, views, config, edge_threshold, generator):
+    """Points on the edges that the edgels of the views agree on. Arguments as for `filter_points`.
+
+    Returns points, directions, Explained and the counts of FilterCounts that this is about.
+    """
+    from taichi_edges.evidence.edgel_matching import EdgelMatching
+    from taichi_edges.evidence.viewing_planes import refine_points
+    from taichi_edges.points.growing import grow_points
+
+    matching = EdgelMatching(views, config.min_views - CONTINUED)
+    found = refine_points(matching, points, directions)
+    supported, steady, _ = judge(matching, found, config)
+    refined, sizes = found.keep(steady), [len(found), supported.sum(), steady.sum()]
+    if config.harvest:  # what an unsteady point explains is a contour, and no edge is to be looked for in it
+        refined = refined.joined(harvest(matching, found.keep(supported), views, config, edge_threshold, generator))
+    sizes.append(len(refined))
+    if config.grow:
+        least = np.full(len(refined), config.grow)
+        least[sizes[2] :] = np.minimum(config.grow, RARE * refined.support[sizes[2] :])  # what was harvested is rare
+        refined = grow_points(matching, refined, least)
+    supported, steady, explained = judge(matching, refined, config)
+    sizes += [len(refined), supported.sum(), steady.sum()]
+    weak, unsteady, harvested, grown, weak_later, unsteady_later = np.abs(np.diff(sizes)).tolist()
+    counts = {"low_support": weak + weak_later, "unsteady": unsteady + unsteady_later}
+    refined = refined.keep(steady)
+    counts = {**counts, "harvested": harvested, "grown": grown}
+    return refined.points, refined.directions, explained.keep(steady), counts
+
+
+def judge(matching, refined, config):
+    """(n,) bool: which RefinedPoints have edgels of their own; and which of these stay on them as the viewpoint moves.
+
+    An occluding contour does not: its support comes from views that happen to look from similar directions. Steadiness
+    is a matter of an edge and not of a point, so the median of a neighbourhood decides, and leniently: there will be
+    surer evidence when the edges are known (`contours.steady_edges`). Returns also the Explained of the points.
+    """
+    from taichi_edges.evidence.explaining import explain
+
+    explained = explain(matching, refined)
+    apart = (refined.views >= FEW_VIEWS * config.min_views) | (
+        refined.spread >= np.sin(np.radians(config.min_angle)) ** 2
+    )
+    supported = (explained.support >= config.min_support) & (refined.views >= config.min_views) & apart
+    steady, places = supported.copy(), refined.points[supported]
+    if len(places):
+        around = cKDTree(places).query(places, min(AROUND, len(places)))[1].reshape(len(places), -1)
+        typical = np.median(explained.steadiness[supported][around], axis=1)
+        steady[supported] = typical >= config.min_steadiness
+    return supported, steady, explained
+
+
+def harvest(matching, refined, views, config, edge_threshold, generator):
+    """RefinedPoints on edges that few views see, voted for by the edgels that the `refined` ones leave unexplained."""
+    from taichi_edges.evidence.edgel_matching import EdgelMatching
+    from taichi_edges.evidence.explaining import unexplained
+    from taichi_edges.evidence.viewing_planes import refine_points
+    from taichi_edges.seeding.voting import vote_seeds
+    from taichi_edges.views.drawing import draw_edge_maps
+
+    left = views.edgels.keep(unexplained(matching, refined))
+    left = replace(views, edgels=left, edge_maps=draw_edge_maps(left, views.height, views.width))
+    seeds = vote_seeds(left, edge_threshold, generator, keep=HARVEST_KEEP)
+    matching = EdgelMatching(left, matching.least_views)
+    found = refine_points(matching, seeds.points, seeds.directions)
+    steady = judge(matching, found, config)[1]
+    return found.keep(steady)
+
+
+def statistical_inliers(points, neighbors, deviations):
+    """Indices of the points whose mean distance to their neighbours is at most mean + deviations * std over all points.
+
+    Open3D's statistical outlier removal. neighbors 0 switches it off.
+    """
+    if neighbors == 0 or len(points) <= neighbors:
+        return np.arange(len(points))
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    _, indices = cloud.remove_statistical_outlier(nb_neighbors=neighbors, std_ratio=deviations)
+    return np.sort(np.asarray(indices, dtype=np.int64))

@@ -1,0 +1,376 @@
+"""All edges of a wireframe moved at once to where the edgels of all views say they are.
+
+Least squares over everything that has a say, each in units of its own standard deviation:
+
+edgels      the distance, px, of an edge from each of its edgels. Errors along an edge are alike over CORRELATED_PX, and
+            so many pixels count as one observation. Geman and McClure's weights leave out what is not the edge's.
+the start   an edge was known to START_PX before. Where the edgels say nothing it stays there, and keeps its ends.
+free ends   where no other edge is met, an end does not move along its edge, of which edgels say nothing.
+joints      where two edges, at least one of them curved, run on into each other, their tangents agree.
+contacts    a vertex lies on the edge it touches.
+relations   what else edges are to each other, see `regularities`.
+
+Unknowns are the vertices, which edges share, and what each shape has of its own (`charts`). Edgels near corners are
+off, so the ends of an edge are where it meets others and not where its edgels end.
+"""
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from scipy.sparse import coo_matrix, diags, identity
+from scipy.sparse.linalg import spsolve
+
+from taichi_edges.evidence.edge_support import SPACING_PX, support_of
+from taichi_edges.geometry.wireframe import Wireframe
+from taichi_edges.refinement.charts import derivatives, moved, nearest_parameters, neighbors, own_unknowns
+
+RADII_PX = (3.0, 2.0, 1.5, 1.0, 1.0)  # of the edgels that are looked at, round by round
+CORRELATED_PX = 40.0  # along an edge: pixels that count as one observation; 20 to 55 in images and in learned maps
+LEAST_NOISE_PX = 0.05  # of the edgels; the best detector's
+TIGHT_RADIUS_PX, SCALE_NOISES = 1.0, 3.0  # so near to the edgels their noise says which of them are the edge's
+START_PX = 1.0  # standard deviation of the edges that are given
+END_PX, MOST_ENDS = 3.0, 0.25  # edgels so near to an end say nothing; at most so much of the length at either end
+PIN_PX = 0.01  # standard deviation of a free end along its edge
+CONTACT_PX = 0.05  # and of a vertex from the edge it touches
+SMOOTH = np.radians(10.0)  # tangents of curves that differ by less run on into each other
+SMOOTH_DEVIATION = np.radians(1.0)  # of these; where they disagree by several, it is a corner after all
+MOST_STRETCH = 1.6  # an edge that becomes longer or shorter by such a factor has flipped
+MOST_PX = 8.0  # an edge that moves farther than this is lost
+PLACES = np.linspace(0.0, 1.0, 9)  # parameters at which that is measured
+POLISHING, HARD = 4, 1e8  # rounds at the end in which contacts and relations become exact, and their weight there
+RIDGE = 1e-9  # relative; keeps what nothing speaks about where it is
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """Something that edges are to each other. hard: it is exact in the end.
+
+    edges: indices of these edges, each once. values: function of their shapes, in this order -> (m,), 0 where it holds.
+    deviation: standard deviation of the values. about: function of a shape; where there is one, `values` is of what it
+    gives, which is found but once for all constraints.
+    """
+
+    edges: tuple
+    values: object
+    deviation: float
+    hard: bool = False
+    about: object = None
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the unknowns of each edge stand among all: first the vertices, three each, then what each edge has alone.
+
+    columns: one int array for each edge, the ends first. size: number of unknowns.
+    """
+
+    columns: tuple
+    size: int
+
+    @staticmethod
+    def of(wireframe):
+        """The Layout of a Wireframe."""
+        columns, size = [], 3 * len(wireframe.vertices)
+        for edge in wireframe.edges:
+            ends = [3 * vertex + axis for vertex in edge.vertices for axis in range(3)]
+            own = own_unknowns(edge.shape)
+            columns.append(np.array([*ends, *range(size, size + own)], dtype=np.int64))
+            size += own
+        return Layout(tuple(columns), size)
+
+    def moved(self, wireframe, step):
+        """The Wireframe after a (size,) step."""
+        vertices = wireframe.vertices + step[: 3 * len(wireframe.vertices)].reshape(-1, 3)
+        edges = []
+        for edge, columns in zip(wireframe.edges, self.columns, strict=True):
+            own = step[columns[3 * len(edge.vertices) :]]
+            ends = vertices[list(edge.vertices)] if edge.vertices else None
+            edges.append(replace(edge, shape=moved(edge.shape, ends, own)))
+        return replace(wireframe, vertices=vertices, edges=tuple(edges))
+
+
+class Equations:
+    """Normal equations, block by block: the sum of weight |values + derivatives step|^2 is to be least."""
+
+    def __init__(self, size):
+        self.size, self.rows, self.columns, self.entries, self.target = size, [], [], [], np.zeros(size)
+
+    def add_block(self, unknowns, matrix, gradient):
+        """A (k, k) matrix and (k,) gradient for (k,) unknowns, of which some may be the same."""
+        rows, columns = np.meshgrid(unknowns, unknowns, indexing="ij")
+        self.rows.append(rows.ravel())
+        self.columns.append(columns.ravel())
+        self.entries.append(matrix.ravel())
+        np.add.at(self.target, unknowns, gradient)
+
+    def add(self, unknowns, values, slopes, weight):
+        """Values (m,) with their derivatives (m, k) by (k,) unknowns."""
+        self.add_block(unknowns, weight * slopes.T @ slopes, weight * slopes.T @ values)
+
+    def matrix(self):
+        """Sparse (size, size)."""
+        if not self.rows:
+            return coo_matrix((self.size, self.size)).tocsc()
+        entries, rows, columns = map(np.concatenate, (self.entries, self.rows, self.columns))
+        return coo_matrix((entries, (rows, columns)), shape=(self.size, self.size)).tocsc()
+
+
+def solve(matrix, gradient, free):
+    """The (size,) step to the minimum; 0 for the unknowns that are not free, (size,) bool."""
+    step, unknowns = np.zeros(len(gradient)), np.flatnonzero(free)
+    matrix = matrix[unknowns][:, unknowns]
+    scale = 1.0 / np.sqrt(np.maximum(matrix.diagonal(), 1e-12 * matrix.diagonal().max(initial=1e-300)))
+    scaled = diags(scale) @ matrix @ diags(scale) + RIDGE * identity(len(unknowns))
+    found = spsolve(scaled.tocsc(), -gradient[unknowns] * scale, permc_spec="MMD_AT_PLUS_A")
+    step[unknowns] = found * scale
+    return step
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What stays the same during an adjustment.
+
+    start: the Wireframe it begins with. layout: of its unknowns. pixel: unit-cube units. relations: Constraints.
+    """
+
+    start: Wireframe
+    layout: Layout
+    pixel: float
+    relations: tuple = ()
+
+
+def adjusted(wireframe, matching, relations=(), radii=RADII_PX):
+    """The Wireframe whose edges agree best with the edgels of all views, without evidence (see `evidence.evidence_of`).
+
+    matching: EdgelMatching. relations: Constraints. radii: px, one for each round.
+    """
+    if not len(wireframe):
+        return wireframe
+    wireframe = replace(wireframe, edges=tuple(replace(edge, evidence=None) for edge in wireframe.edges))
+    problem = Problem(wireframe, Layout.of(wireframe), matching.pixel, tuple(relations))
+    for radius in radii:
+        image = image_equations(problem, wireframe, matching, radius)
+        wireframe = _stepped(problem, wireframe, image)
+    return _touching(_polished(problem, wireframe, image.matrix()))
+
+
+def image_equations(problem, wireframe, matching, radius):
+    """Equations of the edgels, the start and the free ends."""
+    shapes, pixel = wireframe.shapes, problem.pixel
+    support = support_of(matching, shapes, radius)
+    samples = support.samples
+    noise = max(support.noise_px, LEAST_NOISE_PX)
+    widest = matching.scale_px
+    scale = widest if radius > TIGHT_RADIUS_PX else min(widest, SCALE_NOISES * noise)
+    said = matching.equations_of(samples.points, support.edgels, scale).astype(np.float64)
+    counted = _counted(wireframe, samples, pixel) * support.certainty  # what agrees by chance says nothing
+    said *= (counted * SPACING_PX / CORRELATED_PX / noise**2)[:, None]
+    planes, pulls = _across(said, samples.directions)
+    equations = Equations(problem.layout.size)
+    for number, unknowns in enumerate(problem.layout.columns):
+        part = samples.of(number)
+        parameters = samples.parameters[part]
+        slopes = derivatives(neighbors_of(wireframe, number), lambda shape: shape.at(parameters))  # (n, 3, k)
+        before = samples.points[part] - problem.start.edges[number].shape.at(parameters)
+        weight = 1.0 / (len(before) * (START_PX * pixel) ** 2)
+        _add_places(equations, unknowns, slopes, planes[part] + weight * np.eye(3), pulls[part] + weight * before)
+    _pin_free_ends(equations, wireframe, problem.start, PIN_PX * pixel)
+    return equations
+
+
+def _counted(wireframe, samples, pixel):
+    """(n,) float: 0 for samples too near to an end of their edge, or to a vertex that touches it; 1 otherwise."""
+    counted = np.ones(len(samples))
+    for number, edge in enumerate(wireframe.edges):
+        part = samples.of(number)
+        if not edge.shape.closed:
+            margin = min(END_PX * pixel / max(edge.shape.length, 1e-300), MOST_ENDS)
+            position = (np.arange(part.stop - part.start) + 0.5) / (part.stop - part.start)
+            counted[part] = (position >= margin) & (position <= 1 - margin)
+    for vertex, number in wireframe.contacts:
+        part = samples.of(number)
+        counted[part] *= np.linalg.norm(samples.points[part] - wireframe.vertices[vertex], axis=1) > END_PX * pixel
+    return counted
+
+
+def _across(said, directions):
+    """(n, 3, 3) matrices and (n, 3) gradients of the edgels' equations; what they say along the edge is left out."""
+    rows, columns = np.triu_indices(3)
+    matrices = np.empty((len(said), 3, 3))
+    matrices[:, rows, columns] = matrices[:, columns, rows] = said[:, :6]
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    return across @ matrices @ across, (across @ said[:, 6:9, None])[:, :, 0]
+
+
+def _add_places(equations, unknowns, slopes, matrices, gradients):
+    """Add what is said about (n,) places: matrices (n, 3, 3), gradients (n, 3); slopes (n, 3, k) by the unknowns."""
+    flat = slopes.reshape(-1, len(unknowns))
+    weighted = (matrices @ slopes).reshape(-1, len(unknowns))
+    equations.add_block(unknowns, flat.T @ weighted, flat.T @ gradients.ravel())
+
+
+def _pin_free_ends(equations, wireframe, start, deviation):
+    """A vertex in which a single edge ends, and which touches no other, does not move along that edge."""
+    degrees = wireframe.degrees
+    for edge in wireframe.edges:
+        for end, vertex in enumerate(edge.vertices):
+            if degrees[vertex] == 1:
+                along = edge.shape.tangents(np.array([float(end)]))
+                unknowns = 3 * vertex + np.arange(3)
+                gone = along @ (wireframe.vertices[vertex] - start.vertices[vertex])
+                equations.add(unknowns, gone, along, 1.0 / deviation**2)
+
+
+def _ends(wireframe, number):
+    """(2, 3) vertices of an edge, None for a closed one."""
+    vertices = wireframe.edges[number].vertices
+    return wireframe.vertices[list(vertices)] if vertices else None
+
+
+def neighbors_of(wireframe, number):
+    """See `charts.neighbors`."""
+    return neighbors(wireframe.edges[number].shape, _ends(wireframe, number))
+
+
+def _stepped(problem, wireframe, image):
+    """The Wireframe after one step; edges that would flip or be lost stay where they are, and so do their ends.
+
+    image: Equations at the Wireframe.
+    """
+    layout, start = problem.layout, problem.start.shapes
+    constraints = [*smooth_joints(wireframe), *contacts(wireframe, problem.pixel), *problem.relations]
+    joined = constrained(layout, wireframe, constraints)
+    matrix, target = image.matrix() + joined.matrix(), image.target + joined.target
+    free = np.ones(layout.size, bool)
+    while free.any():
+        there = layout.moved(wireframe, solve(matrix, target, free))
+        pairs = enumerate(zip(start, there.shapes, strict=True))
+        lost = [number for number, pair in pairs if _is_lost(*pair, MOST_PX * problem.pixel)]
+        lost = [number for number in lost if free[layout.columns[number]].any()]
+        if not lost:
+            return there
+        for number in lost:
+            free[layout.columns[number]] = False
+    return wireframe
+
+
+def _is_lost(before, after, most):
+    """Whether an edge has changed its length as only a flip does, or is farther away than `most`."""
+    stretch = max(after.length, 1e-300) / max(before.length, 1e-300)
+    moved_by = np.linalg.norm(after.at(PLACES) - before.at(PLACES), axis=1).max()
+    return not (1.0 / MOST_STRETCH <= stretch <= MOST_STRETCH and moved_by <= most)
+
+
+def _polished(problem, wireframe, matrix):
+    """The Wireframe moved to where the hard constraints hold exactly, by as little as `matrix` (of the edgels) says."""
+    for _ in range(POLISHING):
+        constraints = [c for c in (*contacts(wireframe, problem.pixel), *problem.relations) if c.hard]
+        if not constraints:
+            break
+        joined = constrained(problem.layout, wireframe, constraints, HARD)
+        step = solve(matrix + joined.matrix(), joined.target, np.ones(problem.layout.size, bool))
+        wireframe = problem.layout.moved(wireframe, step)
+    return wireframe
+
+
+def _touching(wireframe):
+    """The Wireframe with the vertices that touch edges exactly on these."""
+    for _ in range(POLISHING if len(wireframe.contacts) else 0):
+        vertices = wireframe.vertices.copy()
+        for vertex, number in wireframe.contacts.tolist():
+            touched = wireframe.edges[number].shape
+            vertices[vertex] = touched.at(nearest_parameters(touched, vertices[vertex][None]))[0]
+        wireframe = with_vertices(wireframe, vertices)
+    return wireframe
+
+
+def with_vertices(wireframe, vertices):
+    """The Wireframe with its vertices moved to (V, 3), and its edges with them."""
+    edges = []
+    for edge in wireframe.edges:
+        ends = list(edge.vertices)
+        if ends and (vertices[ends] != wireframe.vertices[ends]).any():
+            edge = replace(edge, shape=moved(edge.shape, vertices[ends], np.zeros(own_unknowns(edge.shape))))
+        edges.append(edge)
+    return replace(wireframe, vertices=vertices, edges=tuple(edges))
+
+
+def constrained(layout, wireframe, constraints, hard=None):
+    """Equations of the constraints at a Wireframe. hard: by how much more they weigh than their deviations say."""
+    equations, described = Equations(layout.size), {}
+    for constraint in constraints:
+        for number in constraint.edges:
+            if (number, constraint.about) not in described:
+                described[number, constraint.about] = _described(wireframe, number, constraint.about)
+        here, nearby = zip(*(described[number, constraint.about] for number in constraint.edges), strict=True)
+        slopes = []
+        for place, pairs in enumerate(nearby):
+            slopes.append(derivatives(pairs, partial(_replaced, constraint.values, here, place)))
+        unknowns = np.concatenate([layout.columns[number] for number in constraint.edges])
+        weight = 1.0 / constraint.deviation**2 * (hard or 1.0)
+        equations.add(unknowns, constraint.values(*here), np.concatenate(slopes, axis=-1), weight)
+    return equations
+
+
+def _described(wireframe, number, about):
+    """An edge's shape and its neighbors, or what `about` gives of each."""
+    shape, pairs = wireframe.edges[number].shape, neighbors_of(wireframe, number)
+    return (about(shape), [(about(one), about(other)) for one, other in pairs]) if about else (shape, pairs)
+
+
+def _replaced(values, arguments, place, argument):
+    """Values of some arguments, of which one has been replaced."""
+    return values(*arguments[:place], argument, *arguments[place + 1 :])
+
+
+def smooth_joints(wireframe):
+    """Constraints of the tangents of two edges, at least one of them curved, that alone meet in a vertex, smoothly."""
+    meeting, degrees = {}, wireframe.degrees
+    for number, edge in enumerate(wireframe.edges):
+        for end, vertex in enumerate(edge.vertices):
+            meeting.setdefault(vertex, []).append((number, end))
+    for vertex, pair in meeting.items():
+        if len(pair) != 2 or degrees[vertex] != 2 or pair[0][0] == pair[1][0]:
+            continue
+        (one, end), (other, other_end) = pair
+        shapes = wireframe.edges[one].shape, wireframe.edges[other].shape
+        values = _turn(end, other_end)
+        off = np.linalg.norm(values(*shapes))
+        if {shape.kind for shape in shapes} != {"line"} and off < SMOOTH:
+            deviation = SMOOTH_DEVIATION * (1.0 + (off / (3 * SMOOTH_DEVIATION)) ** 2)  # Geman and McClure's weight
+            yield Constraint((one, other), values, deviation)
+
+
+def _turn(end, other_end):
+    """Function of two shapes: difference of the tangents where one ends and the other goes on."""
+    sign = 1.0 if end != other_end else -1.0
+
+    def values(shape, other):
+        ahead, on = shape.tangents(np.array([float(end)]))[0], other.tangents(np.array([float(other_end)]))[0]
+        return ahead - sign * on
+
+    return values
+
+
+def contacts(wireframe, pixel):
+    """Constraints of the vertices that touch edges. pixel: unit-cube units."""
+    ending = {}
+    for number, edge in enumerate(wireframe.edges):
+        for end, vertex in enumerate(edge.vertices):
+            ending.setdefault(vertex, (number, end))
+    for vertex, number in wireframe.contacts.tolist():
+        if vertex in ending and ending[vertex][0] != number:
+            touched, place = wireframe.edges[number].shape, wireframe.vertices[vertex]
+            values = _offset(touched, ending[vertex][1], nearest_parameters(touched, place[None]))
+            yield Constraint((ending[vertex][0], number), values, CONTACT_PX * pixel, hard=True)
+
+
+def _offset(touched, end, parameters):
+    """Function of two shapes: how far, across the other, the one ends from the place on the other."""
+    sides = np.linalg.svd(touched.tangents(parameters))[2][1:]
+
+    def values(shape, other):
+        return sides @ (shape.ends[end] - other.at(parameters)[0])
+
+    return values

@@ -1,0 +1,158 @@
+"""Where straight 2D runs of edgels meet edges whose place is known: anchors, which give the runs their depth."""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from taichi_edges.kernels.device import download
+from taichi_edges.views.cameras import NEAR
+
+BEYOND_PX = 8.0  # between the ends of edges that meet, see `junctions.REACH_PX`
+LEAST_CROSSING = 0.3  # sine of the angle in the image at which an anchor is met
+PLACE_PX, SHAPE_PX = 4.0, 1.5  # spacing of the places on runs and on shapes
+CLOSE_PX = 6.0  # where such places are so near, runs may meet shapes
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """matrices: (V, 3, 4) point -> homogeneous pixel. centres: (V, 3). focal: (V,) px."""
+
+    matrices: np.ndarray
+    centres: np.ndarray
+    focal: np.ndarray
+
+    @staticmethod
+    def of(matching):
+        """Those of an EdgelMatching."""
+        matrices = download(matching.cameras).astype(np.float64)
+        centres = -np.linalg.solve(matrices[:, :, :3], matrices[:, :, 3:])[:, :, 0]
+        return Cameras(matrices, centres, np.sqrt(np.abs(np.linalg.det(matrices[:, :, :3]))))
+
+    def project(self, points, views):
+        """Pixels (n, 2), NaN behind the camera, and depths (n,) of points (n, 3), each in its own view (n,)."""
+        matrices = self.matrices[views]
+        homogeneous = np.einsum("nij,nj->ni", matrices[:, :, :3], points) + matrices[:, :, 3]
+        depths = homogeneous[:, 2]
+        return homogeneous[:, :2] / np.where(depths > NEAR, depths, np.nan)[:, None], depths
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Where runs meet known shapes in the image, sorted by the run.
+
+    runs, shapes: (n,) indices. points: (n, 3) on the shape, in the run's viewing plane. ways: (n,) px along the run.
+    sizes: (n,) size of a pixel there, unit-cube units.
+    """
+
+    runs: np.ndarray
+    shapes: np.ndarray
+    points: np.ndarray
+    ways: np.ndarray
+    sizes: np.ndarray
+
+    def __len__(self):
+        return len(self.runs)
+
+    def keep(self, chosen):
+        """Only the chosen ones. chosen: (n,) bool or indices."""
+        return Anchors(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    def sorted(self):
+        """The same in order of their runs, and along these."""
+        return self.keep(np.lexsort((self.ways, self.runs)))
+
+    def joined(self, other, count):
+        """These and those on further shapes, where there are `count` shapes so far."""
+        other = replace(other, shapes=other.shapes + count)
+        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+        return Anchors(*map(np.concatenate, pairs)).sorted()
+
+
+def anchors_of(runs, shapes, cameras, pixel):
+    """The Anchors of Runs on shapes. pixel: unit-cube units."""
+    pieces = pieces_of(shapes, pixel)
+    found, piece = near_pairs(runs, pieces, cameras)
+    views, starts = runs.views[found], runs.ends[found, 0]
+    middles, halves = pieces.points[piece], pieces.halves[piece]
+    lines = np.column_stack([-runs.along[found][:, 1], runs.along[found][:, 0]])
+    lines = np.column_stack([lines, -(lines * starts).sum(axis=1)])  # homogeneous: 0 on the line of the run
+    planes = np.einsum("ni,nij->nj", lines, cameras.matrices[views])
+    steep = (planes[:, :3] * halves).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        steps = -((planes[:, :3] * middles).sum(axis=1) + planes[:, 3]) / steep
+    within = np.abs(steps) <= 1.0 + 1e-6
+    found, piece, views, steps = found[within], piece[within], views[within], steps[within]
+    points = middles[within] + steps[:, None] * halves[within]
+    pixels, depths = cameras.project(points, views)
+    ahead, _ = cameras.project(points + halves[within], views)
+    ways = ((pixels - starts[within]) * runs.along[found]).sum(axis=1)
+    heading = (ahead - pixels) / np.linalg.norm(ahead - pixels, axis=1, keepdims=True)
+    sine = np.abs(heading[:, 0] * runs.along[found][:, 1] - heading[:, 1] * runs.along[found][:, 0])
+    good = (sine >= LEAST_CROSSING) & (ways >= -BEYOND_PX) & (ways <= runs.lengths[found] + BEYOND_PX)
+    anchors = Anchors(found, pieces.shapes[piece], points, ways, depths / cameras.focal[views]).keep(good)
+    return once(anchors)
+
+
+def once(anchors):
+    """The Anchors sorted by run and place along it, without those that two pieces of one shape share."""
+    order = np.lexsort((anchors.ways, anchors.shapes, anchors.runs))
+    anchors = anchors.keep(order)
+    again = (np.diff(anchors.runs) == 0) & (np.diff(anchors.shapes) == 0) & (np.diff(anchors.ways) < 1.0)
+    anchors = anchors.keep(np.append(True, ~again)[: len(anchors)])
+    return anchors.sorted()
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Short straight pieces of shapes. points: (n, 3) their middles. halves: (n, 3) from there to an end.
+
+    shapes: (n,) indices.
+    """
+
+    points: np.ndarray
+    halves: np.ndarray
+    shapes: np.ndarray
+
+
+def pieces_of(shapes, pixel):
+    """The Pieces of shapes; lines and arcs go on a little beyond their ends."""
+    points, halves, counts = [np.zeros((0, 3))], [np.zeros((0, 3))], []
+    for shape in shapes:
+        beyond = BEYOND_PX * pixel / shape.length if shape.kind in ("line", "arc") else 0.0
+        count = max(int(np.ceil(shape.length * (1 + 2 * beyond) / (SHAPE_PX * pixel))), 1)
+        joints = shape.at(np.linspace(-beyond, 1 + beyond, count + 1))
+        points.append(0.5 * (joints[1:] + joints[:-1]))
+        halves.append(0.5 * (joints[1:] - joints[:-1]))
+        counts.append(count)
+    return Pieces(np.concatenate(points), np.concatenate(halves), np.repeat(np.arange(len(shapes)), counts))
+
+
+def near_pairs(runs, pieces, cameras):
+    """(k,) runs and (k,) pieces that come close to each other in the run's view, each pair once."""
+    found, piece = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    every = np.arange(len(pieces.points))
+    for view in np.unique(runs.views):
+        mine = np.flatnonzero(runs.views == view)
+        pixels, _ = cameras.project(pieces.points, np.full(len(every), view))
+        low, high = runs.ends[mine].reshape(-1, 2).min(axis=0), runs.ends[mine].reshape(-1, 2).max(axis=0)
+        seen = every[((pixels >= low - CLOSE_PX) & (pixels <= high + CLOSE_PX)).all(axis=1)]
+        places, owners = places_on(runs, mine)
+        near = cKDTree(places).sparse_distance_matrix(cKDTree(pixels[seen]), CLOSE_PX, output_type="ndarray")
+        pairs = np.unique(owners[near["i"]] * len(every) + seen[near["j"]])
+        found.append(pairs // len(every))
+        piece.append(pairs % len(every))
+    return np.concatenate(found), np.concatenate(piece)
+
+
+def places_on(runs, chosen):
+    """(m, 2) px places on the chosen runs, some beyond their ends, and (m,) the run of each."""
+    counts = np.ceil((runs.lengths[chosen] + 2 * BEYOND_PX) / PLACE_PX).astype(np.int64) + 1
+    owners, share = np.repeat(chosen, counts), ragged(counts) / np.repeat(counts - 1, counts)
+    ways = share * (runs.lengths[owners] + 2 * BEYOND_PX) - BEYOND_PX
+    return runs.ends[owners, 0] + ways[:, None] * runs.along[owners], owners
+
+
+def ragged(counts):
+    """0 .. c - 1 for each of some counts c, one after the other."""
+    return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)

@@ -1,0 +1,320 @@
+"""Strokes that continue each other become one edge, and those that repeat another one go.
+
+Three passes. An arc whose circle goes on along other strokes becomes that circle. Strokes that follow each other
+smoothly form a path, and the path is cut anew into as few shapes as pay (`model_selection`), by dynamic programming
+over all ways to cut it. A stroke that lies beside others on its whole length repeats them.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import chain
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from taichi_edges.fitting.arcs import fit_arc, through_three
+from taichi_edges.fitting.distances import distances_to, unit
+from taichi_edges.fitting.model_selection import Track, best_shape, misfit, observations, track_of
+from taichi_edges.fitting.prices import price_of
+from taichi_edges.geometry.shapes import bounds_of, near_bounds
+
+BESIDE = 3.0  # noises: places so near to a shape are on it
+PARALLEL = np.cos(np.radians(20.0))
+JOINT_COSINE = np.cos(np.radians(25.0))  # between the tangents of two strokes that continue each other
+JOINT_GAP_PX = 12.0  # between their ends, along; a tail or a gap at a touching edge is as long
+JOINT_ASIDE = 0.25  # of that gap: how far aside the other end may lie, beyond BESIDE
+SPACING_PX = 2.0  # of the places by which strokes are compared
+ROUNDING = 1e-9  # relative; what is cheaper by no more is not cheaper
+LEAST_LOOP = 4.0  # times that gap: length of a stroke whose end may continue its start
+LONGEST_RUN = 8  # strokes that may become one at once
+FOLLOWED = 0.5  # of the places of a stroke that the shape which replaces it runs along, at least
+CHORDS = 512  # of a shape, for its tangents
+AROUND, MOST_BALLS = 8.0, 4096  # widths of the band about a circle: length searched at once; into so many at most
+COVERED = 0.5  # of a circle by strokes, at least
+GAP_SHOWN = 0.7  # of what lies between them, which the images must show as well
+GAP_SEEN = 0.25  # a place is shown by this share of the views that see the strokes
+LEAST_GAP_VIEWS = 1.0  # and by one at least
+REPEATED = 0.9  # of the places of a stroke beside others, from which on it says nothing new
+
+
+@dataclass(frozen=True)
+class Merging:
+    """Numbers for the log: circles completed, strokes that were joined to others, strokes that repeated others."""
+
+    circles: int = 0
+    joined: int = 0
+    duplicates: int = 0
+
+
+def continued(shapes, yardstick, pixel, seen, gap_px=JOINT_GAP_PX):
+    """The shapes after all three passes, and Merging.
+
+    shapes: list of shapes in the unit cube. yardstick: Yardstick. pixel: size of a pixel, unit-cube units. seen:
+    function of a shape and (n,) parameters that tells how many views see an edge there, (n,). gap_px: between strokes
+    that continue each other, at most.
+    """
+    rounded, circles = with_whole_circles(shapes, yardstick, pixel, seen)
+    chained = rejoined(rounded, yardstick, pixel, seen, gap_px)
+    single = without_repeats(chained, yardstick, pixel)
+    joined = len(shapes) - len(chained)
+    return single, Merging(circles, joined, len(chained) - len(single))
+
+
+# --------------------------------------------------------------------------------------------------- whole circles
+
+
+def with_whole_circles(shapes, yardstick, pixel, seen):
+    """The shapes, arcs replaced by the circle they are parts of where that goes on; and how many circles that gave."""
+    shapes, circles = list(shapes), []
+    waiting = sorted((n for n, shape in enumerate(shapes) if shape.kind == "arc"), key=lambda n: -shapes[n].length)
+    if not waiting:
+        return shapes, 0
+    tracks = [track_of(shape, pixel) for shape in shapes]
+    places, gone, alive = Places(tracks), set(), np.array([not shape.closed for shape in shapes])
+    for number in waiting:
+        if number in gone:
+            continue
+        alive[list(gone)] = False
+        circle = circle_around(shapes[number], places, alive, yardstick)
+        if circle is None:
+            continue
+        others = np.unique(places.owners[places.about(circle, BESIDE * yardstick.noise, alive)]).tolist()
+        on = {n: on_shape(circle, tracks[n], yardstick) for n in others}
+        parts = [n for n in others if on[n].mean() >= REPEATED]
+        if number not in parts or not is_cheaper(circle, parts, shapes, tracks, yardstick):
+            continue
+        if goes_on(circle, np.concatenate([tracks[n].points[on[n]] for n in others]), pixel, seen, COVERED):
+            circles.append(circle)
+            gone.update(parts)
+    return [shape for n, shape in enumerate(shapes) if n not in gone] + circles, len(circles)
+
+
+class Places:
+    """The places of Tracks in a search tree, so that those about a circle are found without looking at all of them.
+
+    points: (p, 3). owners: (p,) number of the Track. shares: (p,) length that each stands for. longest: (T,) the
+    longest of these of each Track.
+    """
+
+    def __init__(self, tracks):
+        self.points = np.concatenate([track.points for track in tracks])
+        self.shares = np.concatenate([track.share for track in tracks])
+        self.owners = np.repeat(np.arange(len(tracks)), [len(track.points) for track in tracks])
+        self.longest = np.array([track.share.max() for track in tracks])
+        self.tree, self.box = cKDTree(self.points), (self.points.min(axis=0), self.points.max(axis=0))
+
+    def about(self, circle, margin, alive):
+        """Indices, ascending, of the places within `margin` of a circle, of the Tracks that are `alive`, (T,) bool."""
+        step = max(AROUND * margin, circle.length / MOST_BALLS)
+        reach = margin + 0.5 * step
+        centres = circle.at(np.linspace(0.0, 1.0, int(np.ceil(circle.length / step)) + 1))
+        inside = ((centres >= self.box[0] - reach) & (centres <= self.box[1] + reach)).all(axis=1)
+        found = self.tree.query_ball_point(centres[inside], reach)
+        around = np.unique(np.fromiter(chain.from_iterable(found), np.int64))
+        around = around[alive[self.owners[around]]]
+        return around[distances_to(circle, self.points[around]) <= margin]
+
+
+def circle_around(shape, places, alive, yardstick):
+    """The whole circle of an arc, fitted to all the places that lie on it; None where it runs away from the arc.
+
+    places: Places of all Tracks, of which those that are `alive`, (T,) bool, count.
+    """
+    middle = shape.low + 0.5 * (shape.high - shape.low)
+    circle, longest = shape.over(middle - np.pi, middle + np.pi), places.longest[alive].max()
+    for width in (3.0, 2.0, 1.0, 1.0):
+        tolerance = width * BESIDE * yardstick.noise
+        near = places.about(circle, tolerance, alive)
+        if len(near) < 6:
+            return None
+        arc = through_three(*circle.at(np.array([0.25, 0.5, 0.75])))
+        points, shares = places.points[near], places.shares[near] / longest
+        arc = fit_arc(arc, points, np.broadcast_to(arc.tangent, points.shape), 0.0, tolerance, False, shares=shares)
+        if not 0.5 < arc.curvature * shape.radii[0] < 2.0:
+            return None
+        circle = arc.over(0.0, arc.round).shape()
+    return circle
+
+
+def goes_on(shape, places, pixel, seen, least=0.0):
+    """Do strokes, and the images between them, show the whole shape? places: (n, 3) points of strokes on it.
+
+    least: share of the shape that the strokes must cover.
+    """
+    count = max(int(np.ceil(shape.length / pixel)), 8)
+    parameters = (np.arange(count) + 0.5) / count
+    covered = cKDTree(places).query(shape.at(parameters))[0] <= SPACING_PX * pixel
+    if covered.all() or covered.mean() < least or not covered.any():
+        return bool(covered.all())
+    views = seen(shape, parameters)
+    usual = np.median(views[covered])
+    return (views[~covered] >= max(GAP_SEEN * usual, LEAST_GAP_VIEWS)).mean() >= GAP_SHOWN
+
+
+def is_cheaper(shape, parts, shapes, tracks, yardstick):
+    """Does a shape describe what its parts, indices of shapes, describe at less cost (BIC)? tracks: of all shapes."""
+    points, share = (np.concatenate([getattr(tracks[n], name) for n in parts]) for name in ("points", "share"))
+    price = np.log(observations(share, yardstick))
+    before = price * sum(price_of(shapes[n]) for n in parts)
+    return price * price_of(shape) + misfit(distances_to(shape, points), share, yardstick) < before
+
+
+def on_shape(shape, track, yardstick):
+    """(n,) bool: the places of a Track that lie on a shape and run along it."""
+    near = distances_to(shape, track.points) <= BESIDE * yardstick.noise
+    if near.any():
+        along = np.gradient(track.points, axis=0)
+        along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
+        parameters = np.linspace(0, 1, CHORDS)
+        nearest = cKDTree(shape.at(parameters)).query(track.points[near])[1]
+        near[near] = np.abs((shape.tangents(parameters)[nearest] * along[near]).sum(axis=1)) >= PARALLEL
+    return near
+
+
+# ---------------------------------------------------------------------------------------------------- smooth paths
+
+
+def rejoined(shapes, yardstick, pixel, seen, gap_px=JOINT_GAP_PX):
+    """The shapes, each path of strokes that continue each other cut anew into as few as pay."""
+    whole = []
+    for path, closes in smooth_paths(shapes, yardstick, pixel, gap_px):
+        tracks = [oriented(track_of(shapes[number], SPACING_PX * pixel), backward) for number, backward in path]
+        loop = closed_shape([shapes[number] for number, _ in path], tracks, yardstick, pixel, seen) if closes else None
+        whole += [loop] if loop is not None else cut_anew([shapes[n] for n, _ in path], tracks, yardstick, pixel, seen)
+    return whole
+
+
+def closed_shape(parts, tracks, yardstick, pixel, seen):
+    """The closed shape of strokes that follow each other back to the first one, or None where none is cheaper."""
+    track = replace(joined_track(tracks), closed=True)
+    count = observations(track.share, yardstick)
+    worth = np.log(count) * sum(price_of(part) for part in parts)
+    shape, _ = best_shape(track, yardstick, count, worth)
+    return shape if shape is not None and replaces(shape, tracks, yardstick, pixel, seen) else None
+
+
+def smooth_paths(shapes, yardstick, pixel, gap_px):
+    """Lists of (index, reversed) of strokes that continue each other, and whether they come back to their start.
+
+    Every shape is in one of them.
+    """
+    partner = joints(shapes, yardstick, pixel, gap_px)
+    paths, seen = [], set()
+    ends = [(number, side) for number, shape in enumerate(shapes) for side in (0, 1)]
+    starts = [end for end in ends if end not in partner] + ends  # open paths first, then what goes round
+    for number, side in starts:
+        if number in seen:
+            continue
+        path, start, onward = [], (number, side), (number, side)
+        while onward is not None and onward[0] not in seen:
+            number, side = onward
+            seen.add(number)
+            path.append((number, side == 1))
+            onward = partner.get((number, 1 - side))
+        paths.append((path, onward == start))
+    return paths
+
+
+def joints(shapes, yardstick, pixel, gap_px):
+    """{(shape, side): (shape, side)} of ends that continue each other, each the best for the other."""
+    ends = [(number, side) for number, shape in enumerate(shapes) if not shape.closed for side in (0, 1)]
+    if len(ends) < 2:
+        return {}
+    places = np.array([shapes[number].ends[side] for number, side in ends])
+    outward = np.array([(2 * side - 1) * shapes[number].tangents(float(side)) for number, side in ends])
+    found = []
+    for i, j in sorted(cKDTree(places).query_pairs(gap_px * pixel)):
+        same = ends[i][0] == ends[j][0] and shapes[ends[i][0]].length < LEAST_LOOP * gap_px * pixel
+        if same or outward[i] @ outward[j] > -JOINT_COSINE:
+            continue
+        step = places[j] - places[i]
+        along = unit(outward[i] - outward[j])
+        aside = np.linalg.norm(step - (step @ along) * along)
+        if aside <= BESIDE * yardstick.noise + JOINT_ASIDE * abs(step @ along):
+            turn = np.arccos(np.clip(-outward[i] @ outward[j], -1, 1))
+            found.append((aside / yardstick.noise + turn / np.radians(5.0) + abs(step @ along) / (4 * pixel), i, j))
+    partner = {}
+    for _, i, j in sorted(found):
+        if ends[i] not in partner and ends[j] not in partner:
+            partner[ends[i]], partner[ends[j]] = ends[j], ends[i]
+    return partner
+
+
+def cut_anew(parts, tracks, yardstick, pixel, seen):
+    """The shapes that describe a path with the least cost (BIC), each over a run of its strokes.
+
+    parts: the shapes of the strokes, in the order of the path. tracks: their Tracks, in its direction.
+    """
+    count = observations(np.concatenate([track.share for track in tracks]), yardstick)
+    least, choice = [0.0], []
+    for last, shape in enumerate(parts):
+        best = (least[last] + price_of(shape) * np.log(count), last, shape)
+        for first in range(last - 1, max(0, last - LONGEST_RUN + 1) - 1, -1):
+            run = tracks[first : last + 1]
+            worth = (best[0] - least[first]) * (1 - ROUNDING)
+            shape, cost = best_shape(joined_track(run), yardstick, count, worth)
+            if shape is not None and replaces(shape, run, yardstick, pixel, seen):
+                best = (least[first] + cost, first, shape)
+        least.append(best[0])
+        choice.append(best[1:])
+    cut, last = [], len(parts) - 1
+    while last >= 0:
+        first, shape = choice[last]
+        cut.append(shape)
+        last = first - 1
+    return cut[::-1]
+
+
+def replaces(shape, run, yardstick, pixel, seen):
+    """Does the shape say most of what each of the Tracks of a run says, and do the images show it in between?
+
+    Without the former, a short stroke could be explained away by long ones.
+    """
+    for track in run:
+        if (distances_to(shape, track.points) <= BESIDE * yardstick.noise).mean() < FOLLOWED:
+            return False
+    return goes_on(shape, np.concatenate([track.points for track in run]), pixel, seen)
+
+
+def oriented(track, backward):
+    """A Track run the other way round if `backward`."""
+    if not backward:
+        return track
+    length = track.arc[-1] + track.arc[0]
+    return Track(track.points[::-1], length - track.arc[::-1], track.share[::-1], track.closed)
+
+
+def joined_track(tracks):
+    """One Track of several that follow each other; where they overlap, places are in the order of the path."""
+    arcs, offset, before = [], 0.0, None
+    for track in tracks:
+        if before is not None:
+            heading = unit(before.points[-1] - before.points[-2])
+            offset = (
+                arcs[-1][-1] + max((track.points[0] - before.points[-1]) @ heading, -before.share[-1]) - track.arc[0]
+            )
+        arcs.append(track.arc + offset)
+        before = track
+    points, share = (np.concatenate([getattr(track, name) for track in tracks]) for name in ("points", "share"))
+    arc = np.concatenate(arcs)
+    order = np.argsort(arc, kind="stable")
+    return Track(points[order], arc[order], share[order])
+
+
+# --------------------------------------------------------------------------------------------------------- repeats
+
+
+def without_repeats(shapes, yardstick, pixel):
+    """The shapes without those that lie beside longer ones on their whole length."""
+    kept, bounds = set(), bounds_of(shapes)
+    for number in sorted(range(len(shapes)), key=lambda number: -shapes[number].length):
+        track = track_of(shapes[number], pixel)
+        near = kept & set(near_bounds(bounds, track.points, BESIDE * yardstick.noise).tolist())
+        others = [shapes[other] for other in sorted(near)]
+        if not others or beside_others(track, others, yardstick).mean() < REPEATED:
+            kept.add(number)
+    return [shapes[number] for number in sorted(kept)]
+
+
+def beside_others(track, shapes, yardstick):
+    """(n,) bool: the places of a Track that lie on one of the shapes and run along it."""
+    return np.any([on_shape(shape, track, yardstick) for shape in shapes], axis=0)

@@ -1,0 +1,87 @@
+"""How far edges go: free ends move on as far as the images show the edge, and no farther."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from taichi_edges.geometry.shapes import Line
+from taichi_edges.refinement.continuation import GAP_SEEN, LEAST_GAP_VIEWS
+
+AHEAD_PX = 40.0  # looked beyond an end; a longer way takes another round
+LOST_PX = 4.0  # an edge that the images do not show for so long has ended
+ROUNDS = 4
+
+
+def extended(shape, sides, seen, pixel):
+    """A line or an arc, its ends on the given sides moved outwards as far as the images show it; others as they are.
+
+    seen: function of a shape and (n,) parameters: how many views see an edge there that is nobody else's.
+    """
+    return all_extended([shape], [sides], lambda numbers, places: [seen(*places[0])], pixel)[0]
+
+
+def all_extended(shapes, sides, seen, pixel):
+    """`extended` for shapes with the sides of each, one step of all of them at a time.
+
+    seen: function of the indices of some shapes and [(shape, parameters)] as these are by now.
+    """
+    found = list(shapes)
+    steps = {n: _steps(shape, own, pixel) for n, (shape, own) in enumerate(zip(shapes, sides, strict=True)) if own}
+    answers = dict.fromkeys(steps)
+    while steps:
+        questions = {}
+        for number, generator in list(steps.items()):
+            try:
+                questions[number] = generator.send(answers[number])
+            except StopIteration as done:
+                found[number] = done.value
+                del steps[number]
+        asked = seen(list(questions), list(questions.values())) if questions else []
+        answers = dict(zip(questions, asked, strict=True))
+    return found
+
+
+def _steps(shape, sides, pixel):
+    """Generator that asks how many views see places, (shape, parameters), and returns the extended shape."""
+    if shape.kind not in ("line", "arc"):
+        return shape
+    inside = np.linspace(0.05, 0.95, max(int(shape.length / pixel), 5))
+    least = max(GAP_SEEN * np.median((yield shape, inside)), LEAST_GAP_VIEWS)
+    ways = np.arange(1.0, AHEAD_PX + 1.0) * pixel
+    for side in sides:
+        for _ in range(ROUNDS):
+            views = yield shape, side + (2 * side - 1) * ways / shape.length
+            ahead = shown(ways, views >= least, pixel)
+            if ahead <= 0 or turned_round(shape, ahead):
+                break
+            shape = grown(shape, side, ahead)
+            if ahead < 0.5 * AHEAD_PX * pixel:
+                break
+    return shape
+
+
+def shown(ways, good, pixel):
+    """Length beyond an end that the images show. ways: (n,) from it, a pixel apart. good: (n,) bool, seen there?"""
+    last, lost = 0.0, 0.0
+    for way, seen_here in zip(ways, good, strict=True):
+        lost = 0.0 if seen_here else lost + pixel
+        if lost >= LOST_PX * pixel:
+            break
+        last = way if seen_here else last
+    return last
+
+
+def turned_round(shape, ahead):
+    """Would an arc run into itself?"""
+    return shape.kind == "arc" and shape.length + ahead >= 2 * np.pi * shape.radii[0]
+
+
+def grown(shape, side, ahead):
+    """A line or an arc, longer by `ahead` on one side."""
+    parameter = side + (2 * side - 1) * ahead / shape.length
+    if shape.kind == "line":
+        points = shape.points.copy()
+        points[side] = shape.at(parameter)
+        return Line(points)
+    angle = float(shape.angles(parameter))
+    return replace(shape, high=angle) if side else replace(shape, low=angle)

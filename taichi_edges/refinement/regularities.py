@@ -1,0 +1,317 @@
+"""What edges of a designed thing are to each other: parallel, perpendicular, of equal radius, coaxial, coplanar.
+
+A relation is a hypothesis with fewer unknowns than the edges have without it. Imposing it raises the sum of squared
+residuals, in units of their standard deviation; how much is known beforehand from the equations of the adjustment:
+d^T S^-1 d for a relation that is off by d, with the covariance S. By BIC it is there if that is at most ln n for every
+unknown that it takes away, n observations. So a wedge of 2 degrees stays one where the images tell it from none, and
+what has been imposed counts when the next relation is judged.
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations
+
+import numpy as np
+
+from taichi_edges.evidence.edge_support import SPACING_PX, support_of
+from taichi_edges.fitting.arcs import cross
+from taichi_edges.refinement.adjustment import (
+    CORRELATED_PX,
+    LEAST_NOISE_PX,
+    Constraint,
+    Layout,
+    Problem,
+    adjusted,
+    constrained,
+    contacts,
+    image_equations,
+    neighbors_of,
+    smooth_joints,
+)
+from taichi_edges.refinement.charts import STEP, derivatives
+
+KINDS = ("parallel", "perpendicular", "equal_radius", "coaxial", "coplanar")
+MOST_TURN = np.radians(2.0)  # what is farther from parallel or perpendicular is no candidate; by chance 1 pair in 30 is
+MOST_OFF_PX, MOST_RATIO = 3.0, 0.05  # distances and radii, likewise
+DEVIATION = 1e-4  # of what is imposed, radians or unit-cube units, until it is made exact
+IMPLIED = 1e-6  # standard deviation of what other relations imply
+CLOSE = 2e-3  # how far it may be off as these are linear
+RADIUS_PX = 1.0  # of the edgels from which covariances come
+CHECKS = 4  # adjustments after which relations that the images contradict have been given up
+DIRECTION, PLACE, RADIUS = slice(0, 3), slice(3, 6), 6
+
+
+def features(shape):
+    """(7,) what relations are about: direction of a line or normal of a plane, middle or centre, radius (0: none)."""
+    if shape.kind == "line":
+        return np.concatenate([shape.tangents(0.5), shape.at(0.5), [0.0]])
+    radius = shape.radii.mean() if shape.circular else 0.0
+    normal = cross(*shape.axes)
+    return np.concatenate([normal / np.sqrt(normal @ normal), shape.centre, [radius]])
+
+
+@dataclass(frozen=True)
+class Relation:
+    """kind: one of KINDS. edges: indices, each once. values: function of their features -> (m,), 0 where it holds."""
+
+    kind: str
+    edges: tuple
+    values: object
+
+    def constraint(self):
+        """The Constraint that makes it hold."""
+        return Constraint(self.edges, self.values, DEVIATION, hard=True, about=features)
+
+
+def regularised(wireframe, matching):
+    """An adjusted Wireframe with the relations that its edges have as far as the images can tell.
+
+    matching: EdgelMatching. Returns the Wireframe, and {kind: (number found, number of these that were imposed)}; the
+    others follow from those.
+    """
+    found, imposed = found_relations(wireframe, matching)
+    before, relations, regular = support_of(matching, wireframe.shapes, RADIUS_PX), imposed, wireframe
+    for _ in range(CHECKS):
+        if not relations:
+            break
+        regular = adjusted(
+            wireframe, matching, [relation.constraint() for relation in relations], radii=(RADIUS_PX,) * 2
+        )
+        risen = _risen(before, support_of(matching, regular.shapes, RADIUS_PX), relations)
+        if not risen:
+            break
+        relations = [relation for relation in relations if not risen & set(relation.edges)]
+        regular = wireframe
+    else:
+        relations = []
+    lost = Counter(relation.kind for relation in imposed) - Counter(relation.kind for relation in relations)
+    kept = Counter(relation.kind for relation in relations)
+    return regular, {kind: (found[kind] - lost[kind], kept[kind]) for kind in KINDS}
+
+
+def found_relations(wireframe, matching):
+    """Counter of the relations found by kind, and the list of those that the others do not imply."""
+    counts, imposed = Counter(), []
+    judge = Judge.of(wireframe, matching)
+    for kind in KINDS:
+        candidates = [(relation, judge.linear(relation)) for relation in CANDIDATES[kind](wireframe, matching.pixel)]
+        for relation, linear in sorted(candidates, key=lambda pair: judge.rise(pair[1])):
+            if judge.rise(linear) <= judge.allowed:
+                counts[kind] += 1
+                if judge.impose(linear):
+                    imposed.append(relation)
+    return counts, imposed
+
+
+@dataclass(frozen=True)
+class Linear:
+    """values: (m,) of a relation. slopes: (m, k) their derivatives by (k,) `unknowns`, each once."""
+
+    values: np.ndarray
+    slopes: np.ndarray
+    unknowns: np.ndarray
+
+
+class Judge:
+    """What is known of the edges: linear, with a covariance, and with what has been imposed so far.
+
+    allowed: rise of the sum of squares for each unknown less, ln n.
+    """
+
+    @staticmethod
+    def of(wireframe, matching):
+        """From the equations of an adjusted Wireframe."""
+        layout = Layout.of(wireframe)
+        problem = Problem(wireframe, layout, matching.pixel)
+        image = image_equations(problem, wireframe, matching, RADIUS_PX)
+        joints = [*smooth_joints(wireframe), *contacts(wireframe, matching.pixel)]
+        matrix = (image.matrix() + constrained(layout, wireframe, joints).matrix()).toarray()
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        covariance = (
+            np.linalg.inv(matrix * scale * scale[:, None] + 1e-12 * np.eye(len(scale))) * scale * scale[:, None]
+        )
+        support = support_of(matching, wireframe.shapes, RADIUS_PX)
+        observations = (support.edgels >= 0).sum() * SPACING_PX / CORRELATED_PX
+        return Judge(wireframe, layout, covariance, np.log(max(observations, 2.0)))
+
+    def __init__(self, wireframe, layout, covariance, allowed):
+        self.columns, self.covariance, self.allowed = layout.columns, covariance, allowed
+        self.shift = np.zeros(layout.size)
+        self.features, self.slopes = {}, {}
+        for number, shape in enumerate(wireframe.shapes):
+            if shape.kind != "spline":
+                self.features[number] = features(shape)
+                self.slopes[number] = derivatives(neighbors_of(wireframe, number), features)
+
+    def linear(self, relation):
+        """A relation as a Linear one, at the wireframe as it was given."""
+        given = np.concatenate([self.features[number] for number in relation.edges])
+        pieces = len(relation.edges)
+
+        def values(step):
+            return relation.values(*(given + step).reshape(pieces, -1))
+
+        by_features = np.stack([(values(s) - values(-s)) / (2 * STEP) for s in STEP * np.eye(len(given))], axis=1)
+        blocks = zip(np.split(by_features, pieces, axis=1), relation.edges, strict=True)
+        slopes = np.concatenate([block @ self.slopes[number] for block, number in blocks], axis=1)
+        unknowns = np.concatenate([self.columns[number] for number in relation.edges])
+        each = np.unique(unknowns)  # edges that share a vertex share unknowns
+        summed = np.zeros((len(slopes), len(each)))
+        np.add.at(summed.T, np.searchsorted(each, unknowns), slopes.T)
+        return Linear(values(0.0), summed, each)
+
+    def rise(self, linear):
+        """Rise of the sum of squares for each unknown that a relation takes away; 0 where it is implied."""
+        off, powers, free, _, _ = self._axes(linear)
+        if (np.abs(off[~free]) > CLOSE).any():
+            return np.inf
+        return float((off[free] ** 2 / powers[free]).sum() / max(free.sum(), 1))
+
+    def impose(self, linear):
+        """Take a relation for granted. Returns whether it was not implied already."""
+        off, powers, free, axes, reach = self._axes(linear)
+        gain = reach @ (axes[:, free] / powers[free])
+        self.shift -= gain @ off[free]
+        self.covariance -= gain @ (reach @ axes[:, free]).T
+        return bool(free.any())
+
+    def _axes(self, linear):
+        """The values on their principal axes, variances there, whether these are more than 0, the axes (m, m); and
+        covariances (size, m) of all unknowns with the values.
+        """
+        reach = self.covariance[:, linear.unknowns] @ linear.slopes.T
+        powers, axes = np.linalg.eigh(linear.slopes @ reach[linear.unknowns])
+        off = axes.T @ (linear.values + linear.slopes @ self.shift[linear.unknowns])
+        return off, powers, powers > IMPLIED**2, axes, reach
+
+
+def _risen(before, after, relations):
+    """Set of the edges whose own residuals have risen by more than their relations are worth."""
+    noise = max(before.noise_px, LEAST_NOISE_PX)
+    observations = before.samples.sums((before.edgels >= 0).sum(axis=1)) * SPACING_PX / CORRELATED_PX
+    rise = observations * (after.residual_px**2 - before.residual_px**2) / noise**2
+    related = Counter(number for relation in relations for number in relation.edges)
+    allowed = 2.0 * np.log(max(observations.sum(), 2.0))
+    return {number for number in related if rise[number] > allowed * max(related[number], 1)}
+
+
+def _of_kind(wireframe, *kinds):
+    """[(index, features)] of the edges of some kinds."""
+    return [(number, features(shape)) for number, shape in enumerate(wireframe.shapes) if shape.kind in kinds]
+
+
+LINES, ROUND, FLAT = ("line",), ("arc", "circle"), ("arc", "circle", "elliptic_arc", "ellipse")
+
+
+def _parallel(wireframe, pixel):
+    """Directions of lines, and normals of arcs."""
+    for (one, a), (other, b) in combinations(_of_kind(wireframe, *LINES, *FLAT), 2):
+        if np.linalg.norm(cross(a[DIRECTION], b[DIRECTION])) < np.sin(MOST_TURN):
+            yield Relation("parallel", (one, other), partial(_cross, _sides(a[DIRECTION])))
+
+
+def _perpendicular(wireframe, pixel):
+    """Likewise."""
+    for (one, a), (other, b) in combinations(_of_kind(wireframe, *LINES, *FLAT), 2):
+        if abs(a[DIRECTION] @ b[DIRECTION]) < np.sin(MOST_TURN):
+            yield Relation("perpendicular", (one, other), _cosine)
+
+
+def _equal_radius(wireframe, pixel):
+    """Arcs and circles."""
+    for (one, a), (other, b) in combinations(_of_kind(wireframe, *ROUND), 2):
+        if abs(a[RADIUS] - b[RADIUS]) < min(MOST_OFF_PX * pixel, MOST_RATIO * a[RADIUS]):
+            yield Relation("equal_radius", (one, other), _radii)
+
+
+def _coaxial(wireframe, pixel):
+    """Arcs and circles: the centre of one on the axis of the other."""
+    for (one, a), (other, b) in combinations(_of_kind(wireframe, *ROUND), 2):
+        axis = a[DIRECTION]
+        if np.linalg.norm(cross(axis, b[DIRECTION])) < np.sin(MOST_TURN):
+            if np.linalg.norm(cross(axis, b[PLACE] - a[PLACE])) < MOST_OFF_PX * pixel:
+                yield Relation("coaxial", (one, other), partial(_off_axis, _sides(axis)))
+
+
+def _coplanar(wireframe, pixel):
+    """Lines and arcs in the plane of an arc, or in that of two lines that share a vertex."""
+    planes = []
+    edges = dict(_of_kind(wireframe, *LINES, *FLAT))
+    for members in _plane_spans(wireframe, edges):
+        normal, place = _plane(*(edges[number] for number in members))
+        if any(_in_plane(normal, place, *plane, pixel) for plane in planes):
+            continue
+        planes.append((normal, place))
+        for number, feature in edges.items():
+            flat = wireframe.shapes[number].kind != "line"
+            if number not in members and _lies_in(normal, place, feature, flat, pixel):
+                sides = _sides(normal)
+                yield Relation("coplanar", (*members, number), partial(_off_plane, sides if flat else None))
+
+
+def _plane_spans(wireframe, edges):
+    """Tuples of edges that span a plane: arcs and circles, then pairs of lines that share a vertex."""
+    yield from ((number,) for number in edges if wireframe.shapes[number].kind != "line")
+    for one, other in combinations([number for number in edges if wireframe.shapes[number].kind == "line"], 2):
+        if set(wireframe.edges[one].vertices) & set(wireframe.edges[other].vertices):
+            if np.linalg.norm(cross(edges[one][DIRECTION], edges[other][DIRECTION])) > 0.5:
+                yield one, other
+
+
+def _plane(*span):
+    """Unit normal and a place of the plane of an arc, or of two lines."""
+    if len(span) == 1:
+        return span[0][DIRECTION], span[0][PLACE]
+    normal = cross(span[0][DIRECTION], span[1][DIRECTION])
+    return normal / np.linalg.norm(normal), span[0][PLACE]
+
+
+def _in_plane(normal, place, other, where, pixel):
+    """Whether two planes are one, as far as candidates go."""
+    turned = np.linalg.norm(cross(normal, other)) < np.sin(MOST_TURN)
+    return turned and abs((place - where) @ other) < MOST_OFF_PX * pixel
+
+
+def _lies_in(normal, place, feature, flat, pixel):
+    """Whether an edge is in a plane, as far as candidates go."""
+    turn = np.linalg.norm(cross(normal, feature[DIRECTION])) if flat else abs(normal @ feature[DIRECTION])
+    return turn < np.sin(MOST_TURN) and abs(normal @ (feature[PLACE] - place)) < MOST_OFF_PX * pixel
+
+
+def _sides(direction):
+    """(2, 3) unit vectors across a direction."""
+    return np.linalg.svd(direction[None])[2][1:]
+
+
+def _cross(sides, a, b):
+    return sides @ cross(a[DIRECTION], b[DIRECTION])
+
+
+def _cosine(a, b):
+    return np.array([a[DIRECTION] @ b[DIRECTION]])
+
+
+def _radii(a, b):
+    return np.array([a[RADIUS] - b[RADIUS]])
+
+
+def _off_axis(sides, a, b):
+    return sides @ cross(a[DIRECTION], b[PLACE] - a[PLACE])
+
+
+def _off_plane(sides, *span):
+    """The last of the features against the plane of the others. sides: across its normal, None for a line."""
+    normal, place = _plane(*span[:-1])
+    last = span[-1]
+    turn = [normal @ last[DIRECTION]] if sides is None else sides @ cross(normal, last[DIRECTION])
+    return np.array([*turn, normal @ (last[PLACE] - place)])
+
+
+CANDIDATES = {
+    "parallel": _parallel,
+    "perpendicular": _perpendicular,
+    "equal_radius": _equal_radius,
+    "coaxial": _coaxial,
+    "coplanar": _coplanar,
+}

@@ -1,0 +1,140 @@
+"""From single edges to a wireframe: connected, minimal, in agreement with the images."""
+
+from dataclasses import asdict, astuple, dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from taichi_edges.evidence.edge_support import (
+    claims_of,
+    evidence_of,
+    steadiness,
+    support_along,
+    support_of,
+    support_of_places,
+    support_share,
+)
+from taichi_edges.evidence.edgel_matching import EdgelMatching
+from taichi_edges.fitting.model_selection import Yardstick
+from taichi_edges.refinement.adjustment import adjusted
+from taichi_edges.refinement.anchoring import anchored_lines
+from taichi_edges.refinement.completion import completed
+from taichi_edges.refinement.continuation import Merging, continued
+from taichi_edges.refinement.extents import all_extended
+from taichi_edges.refinement.junctions import connected
+from taichi_edges.refinement.regularities import found_relations, regularised
+
+NOISE_PX = 0.2  # by which an edge is off its shape, beyond the noise: next to other edges every detector is biased
+STRETCH_PX = 4.0  # length of an edge on which the errors go together
+LEAST_LENGTH_PX = 0.1  # of a stroke; a shorter one has no direction
+WIDE_GAP_PX = 24.0  # between strokes that continue each other, where their ends are still free after the first pass
+MOST_COMPARED = 150  # edges whose relations are counted where nobody asked for them: there are as many as its square
+LEAST_CONFIDENCE = 0.2  # of an edge, see `evidence.evidence_of`
+LENIENT = 0.75  # of the steadiness, for edges that have not been adjusted
+LEAST_SUPPORTED = 0.33  # of the length of an edge; where edges touch, only one of them owns the edgels
+
+
+@dataclass(frozen=True)
+class RefineCounts:
+    """What the refinement did.
+
+    circles: arcs that became whole circles. joined: strokes that became part of others. duplicates: strokes that
+    repeated others. anchored: lines hung up on edges that they meet. lines: added between vertices. unsupported: edges
+    left out as the images do not show them.
+    relations: {kind: (how many were found, how many of these were imposed)}; what those imply is not imposed again.
+    """
+
+    circles: int = 0
+    joined: int = 0
+    duplicates: int = 0
+    anchored: int = 0
+    lines: int = 0
+    unsupported: int = 0
+    relations: dict = field(default_factory=dict)
+
+
+def refine_wireframe(loose, views, config):
+    """The Wireframe of `loose` edges, in the unit cube, and RefineCounts.
+
+    views: Views. config: the scene's `refine` section. ti.init must have been called.
+    """
+    if not config.enabled or not len(loose):
+        return loose, RefineCounts()
+    matching = EdgelMatching(views, config.min_views)
+    strokes = [shape for shape in loose.shapes if shape.length >= LEAST_LENGTH_PX * matching.pixel]
+    shapes, merging, unsupported = whole_edges(strokes, matching, config)
+    anchored = anchored_lines(matching, shapes) if config.anchor else []
+    wireframe, lines = completed(connected([*shapes, *anchored], matching.pixel), matching)
+    wireframe, relations = related(adjusted(wireframe, matching), matching, config.regularise)
+    judged = with_evidence(wireframe, matching, config)
+    unsupported += len(wireframe) - len(judged)
+    added = {"anchored": len(anchored), "lines": lines}
+    return judged, RefineCounts(**asdict(merging), **added, unsupported=unsupported, relations=relations)
+
+
+def whole_edges(shapes, matching, config):
+    """The shapes of whole edges from those of strokes, Merging, and how many were left out for lack of support.
+
+    Free ends are extended only when it is known which are free, and then some more strokes continue each other.
+    """
+    pixel, seen = matching.pixel, partial(support_along, matching)
+    yardstick = yardstick_of(shapes, matching)
+    shapes, first = continued(shapes, yardstick, pixel, seen)
+    kept = with_support(matching, shapes, config)
+    longer, second = continued(with_longer_ends(matching, kept), yardstick, pixel, seen, WIDE_GAP_PX)
+    found = with_support(matching, longer, config)
+    merging = Merging(*(sum(pair) for pair in zip(astuple(first), astuple(second), strict=True)))
+    return found, merging, len(shapes) - len(kept) + len(longer) - len(found)
+
+
+def yardstick_of(shapes, matching):
+    """The Yardstick of strokes: the noise of their edgels, and by how much edges are off beyond it."""
+    noise = np.hypot(NOISE_PX, support_of(matching, shapes).noise_px)
+    return Yardstick(noise * matching.pixel, STRETCH_PX * matching.pixel)
+
+
+def related(wireframe, matching, impose):
+    """The Wireframe, with the relations that its edges have if these are to be imposed; and RefineCounts.relations."""
+    if impose:
+        return regularised(wireframe, matching)
+    if len(wireframe) > MOST_COMPARED:
+        return wireframe, {}
+    return wireframe, {kind: (count, 0) for kind, count in found_relations(wireframe, matching)[0].items()}
+
+
+def with_evidence(wireframe, matching, config):
+    """The Wireframe with what the images say about each edge, and without those they do not support."""
+    support = support_of(matching, wireframe.shapes)
+    found = evidence_of(support)
+    edges = tuple(replace(edge, evidence=of) for edge, of in zip(wireframe.edges, found, strict=True))
+    sure = np.array([of.confidence >= LEAST_CONFIDENCE for of in found], dtype=bool)
+    return replace(wireframe, edges=edges).keep(sure & is_edge(matching, support, wireframe.shapes, config))
+
+
+def with_support(matching, shapes, config):
+    """The shapes that the images support; their places are not exact yet."""
+    kept = is_edge(matching, support_of(matching, shapes), shapes, config, LENIENT)
+    return [shape for shape, keep in zip(shapes, kept, strict=True) if keep]
+
+
+def is_edge(matching, support, shapes, config, lenience=1.0):
+    """(E,) bool: enough of a shape is supported, by enough views, and its edgels stay on it as the viewpoint moves.
+
+    config: the scene's `refine` section. lenience: factor on what it asks for.
+    """
+    enough = support.supported_lengths >= LEAST_SUPPORTED * np.array([shape.length for shape in shapes])
+    if config.min_support:
+        enough &= support_share(matching, support) >= lenience * config.min_support
+    return enough & (steadiness(matching, support) >= lenience * config.min_steadiness)
+
+
+def with_longer_ends(matching, shapes):
+    """The shapes, ends that would meet no other extended as far as the images show them."""
+    wireframe, claims = connected(shapes, matching.pixel), claims_of(matching, shapes)
+    degrees = wireframe.degrees
+    free = [[side for side, end in enumerate(edge.vertices) if degrees[end] == 1] for edge in wireframe.edges]
+
+    def seen(numbers, places):
+        return support_of_places(matching, places, claims, numbers)
+
+    return all_extended(shapes, free, seen, matching.pixel)

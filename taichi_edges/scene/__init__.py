@@ -1,0 +1,1 @@
+"""What a scene says: every setting, presets, and the YAML file."""

@@ -1,0 +1,1 @@
+"""Where Gaussians begin: places that many views agree on."""

@@ -1,0 +1,213 @@
+"""Whole lines and circular arcs that claim the oriented points, best supported first.
+
+Graph traversal follows an edge wherever it goes smoothly, at a tangential touch into the other edge too. Here a line
+and an arc grow from seeds over all points, as far as places and directions agree. The one with the greatest support
+claims its points, the next one what is left; so a rim that touches other edges is one closed circle, and the points
+that remain are the other edges. Points at a contact are claimed by one and shared by both.
+"""
+
+import heapq
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from taichi_edges.fitting.arc_batch import ArcBatch
+from taichi_edges.fitting.arcs import Arc, fit_arc
+from taichi_edges.fitting.prices import price
+from taichi_edges.strokes.arc_growth import INLIER, grown_from_seeds, unbroken
+
+OUTLIER = INLIER**2  # squared noises: what a point on an edge brings at most
+OWN_SHARE = 0.5  # of the points along a stretch, which must be an arc's own: elsewhere it repeats another
+LEAST_DENSITY = 4.0  # own points on the length of a gap, on average; strays line up by chance, but not so closely
+ROUNDS, COARSER = 3, 2.0  # of claiming, and from the noise of one to that of the next
+MOST_NOISE = 2e-3  # unit-cube units; coarser rounds would claim neighbouring edges (the paper's lines take 5e-3)
+LEAST_AT_ONCE, MOST_AT_ONCE = 16, 512  # seeds from which arcs are grown together
+USED = 0.7  # of the arcs of one such batch, for the next to be larger
+WINDOW = 8192  # seeds among which these are looked for
+TAIL = 0.7  # of the gap: an edge goes on past its sharp points in steps of that size at most
+
+
+@dataclass(frozen=True)
+class Claim:
+    """An arc and its points: those it owns, and those it shares with a better supported one; ascending indices."""
+
+    arc: Arc
+    own: np.ndarray
+    shared: np.ndarray
+
+    @property
+    def members(self):
+        """All of its points."""
+        return np.concatenate([self.own, self.shared])
+
+
+class Ledger:
+    """Who owns each point, (n,) ints, -1 for nobody; and the noise at which it was claimed, (n,) unit-cube units."""
+
+    def __init__(self, count):
+        self.owner, self.noise = np.full(count, -1), np.full(count, np.inf)
+
+    def enter(self, members, owner, noise):
+        """The points in `members` now belong to `owner`."""
+        self.owner[members], self.noise[members] = owner, noise
+
+
+def claims(cloud, neighbors, seeds, min_points):
+    """Claims of lines and arcs that own disjoint points; and the Ledger that says so.
+
+    neighbors: for every point its aligned neighbours, an index array. seeds: (n,) indices, best first.
+    Edges that few views see are noisier than others. Their turn comes when the sharp ones have their points: in every
+    round the tolerance is COARSER times that of the round before, and what is found already grows first.
+    """
+    ledger, found, finest = Ledger(len(cloud.points)), [], cloud.scale.noise
+    for number in range(ROUNDS):
+        noise = finest * COARSER**number
+        if number and noise > MOST_NOISE:
+            break
+        cloud = cloud.at_scale(replace(cloud.scale, noise=noise, spread=COARSER**number))
+        found = [widened(cloud, claim, ledger, k, beyond=0.0) for k, claim in enumerate(found)]
+        claim_round(cloud, neighbors, seeds[ledger.owner[seeds] < 0], min_points, ledger, found)
+        found = [widened(cloud, claim, ledger, k, beyond=TAIL * cloud.scale.gap) for k, claim in enumerate(found)]
+    return [refined(cloud, claim, ledger) for claim in found], ledger
+
+
+def claim_round(cloud, neighbors, seeds, min_points, ledger, found):
+    """Add to the Claims in `found`, and to the Ledger, what can be claimed at the cloud's scale."""
+    waiting, owner = [], ledger.owner
+    for number, (gain, *candidate) in enumerate(candidates(cloud, neighbors, seeds, min_points, owner)):
+        heapq.heappush(waiting, (-gain, number, *candidate))
+    while waiting:
+        _, number, *candidate = heapq.heappop(waiting)
+        gain, claim = supported(cloud, *candidate, owner, min_points)
+        if gain <= 0:
+            continue
+        if waiting and gain < -waiting[0][0]:  # others have claimed its points: let it wait for its new turn
+            heapq.heappush(waiting, (-gain, number, *candidate))
+            continue
+        ledger.enter(claim.own, len(found), cloud.scale.noise)
+        found.append(claim)
+
+
+def widened(cloud, claim, ledger, number, beyond):
+    """The Claim with the points that nobody owns and that lie on it at the cloud's scale; the Ledger is told.
+
+    beyond: how far it may go on past its ends, without a longer step, unit-cube units.
+    """
+    arc = claim.arc
+    reach = 0.0 if arc.closed else cloud.scale.gap * (beyond > 0)
+    members, along, _ = cloud.inliers(arc, arc.low - reach, arc.high + reach)
+    free = ledger.owner[members] < 0
+    members, along = members[free], along[free]
+    if beyond and not arc.closed and len(members):
+        stations = np.concatenate([along, np.linspace(arc.low, arc.high, int(arc.length / beyond) + 2)])
+        good = unbroken(stations, arc.low, arc.high, beyond)[: len(along)]
+        members, along = members[good], along[good]
+    if not len(members):
+        return claim
+    ledger.enter(members, number, cloud.scale.noise)
+    ends = (arc.low, arc.high) if arc.closed else (min(arc.low, along.min()), max(arc.high, along.max()))
+    return Claim(arc.over(*ends), np.union1d(claim.own, members), np.setdiff1d(claim.shared, members))
+
+
+def refined(cloud, claim, ledger):
+    """The Claim with its arc fitted once more to all of its points, each as sharply as it was claimed."""
+    members, noises = claim.members, ledger.noise[claim.members]
+    places, directions = cloud.points[members], cloud.directions[members]
+    shares, tolerance = (noises.min() / noises) ** 2, INLIER * noises.max()
+    arc = claim.arc.recentred()
+    arc = fit_arc(arc, places, directions, 0.0, tolerance, arc.curvature == 0, shares=shares)
+    return Claim(arc, claim.own, claim.shared)
+
+
+def candidates(cloud, neighbors, seeds, min_points, owner):
+    """Gains, Arcs and `Cloud.inliers` of these: grown from seeds until every point that nobody owns is on one.
+
+    Or has grown none.
+    """
+    covered = owner >= 0
+    for seed, grown in grown_pairs(cloud, neighbors, seeds, covered):
+        covered[seed] = True
+        gains = [supported(cloud, arc, inliers, owner, min_points)[0] for arc, inliers in grown]
+        for (arc, inliers), gain in zip(grown, gains, strict=True):
+            if gain == max(gains):  # even where it is too short to be claimed: its points will not do better
+                covered[inliers[0]] = True
+            if gain > 0:
+                yield gain, arc, inliers
+
+
+def grown_pairs(cloud, neighbors, seeds, covered):
+    """(seed, [(Arc, its `Cloud.inliers`)]) of one seed after the other that is not covered when its turn comes.
+
+    covered: (n,) bool, which changes meanwhile. Arcs of seeds that are covered by then are dropped; where that were
+    many, fewer are grown at once the next time.
+    """
+    first, count = 0, LEAST_AT_ONCE
+    while first < len(seeds):
+        waiting = first + np.flatnonzero(~covered[seeds[first : first + WINDOW]])[:count]
+        first = int(waiting[-1]) + 1 if len(waiting) == count else first + WINDOW
+        some = seeds[waiting]
+        pairs = [[arc for arc in pair if arc is not None] for pair in grown_from_seeds(cloud, neighbors, some)]
+        inliers = iter(inliers_of_each(cloud, [arc for pair in pairs for arc in pair]))
+        used = 0
+        for seed, pair in zip(some.tolist(), pairs, strict=True):
+            grown = [(arc, next(inliers)) for arc in pair]
+            if not covered[seed]:
+                used += 1
+                yield seed, grown
+        count = min(2 * count, MOST_AT_ONCE) if used >= USED * len(some) else max(count // 2, LEAST_AT_ONCE)
+
+
+def inliers_of_each(cloud, arcs):
+    """`Cloud.inliers` of each of some Arcs on its whole length, a list."""
+    if not arcs:
+        return []
+    batch = ArcBatch.of(arcs)
+    of, *columns = cloud.inliers_of(batch, batch.low, batch.high)
+    bounds = np.searchsorted(of, np.arange(1, len(arcs)))
+    return list(zip(*(np.split(column, bounds) for column in columns), strict=True))
+
+
+def supported(cloud, arc, inliers, owner, min_points):
+    """What an arc gains by the points that nobody owns, net of its price; and its Claim on them.
+
+    inliers: `Cloud.inliers` of the arc on its whole length. A stretch counts where most points along it are its own.
+    Shared points carry it across a contact, no farther.
+    """
+    members, along, squared = inliers
+    own = owner[members] < 0
+    if own.sum() < min_points:
+        return 0.0, None
+    kept = _own_stretches(along, own, cloud.scale.gap)
+    own &= kept
+    if own.sum() < min_points:
+        return 0.0, None
+    if own.sum() * cloud.scale.gap < LEAST_DENSITY * np.ptp(along[own]):
+        return 0.0, None
+    gain = (OUTLIER - squared[own]).sum() - price(arc) * np.log(len(members))
+    whole = arc if arc.closed and own.mean() >= OWN_SHARE else arc.over(along[kept].min(), along[kept].max())
+    return gain, Claim(whole, members[own], members[kept & ~own])
+
+
+def _own_stretches(along, own, gap):
+    """(n,) bool: the points of an arc's own stretches and between them.
+
+    A stretch lies between gaps in the own points, and these are the majority of its points. Stretches are one where
+    shared points join them, over no more than the length of the two: else the arc repeats another one.
+    """
+    order = np.argsort(along, kind="stable")
+    mine = along[order[own[order]]]
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(mine) > gap]))
+    lows, highs = mine[starts], mine[np.append(starts[1:], len(mine)) - 1]
+    first, last = np.searchsorted(along[order], lows), np.searchsorted(along[order], highs, side="right")
+    owned = np.concatenate([[0], np.cumsum(own[order])])
+    good = owned[last] - owned[first] >= OWN_SHARE * (last - first)
+    spans = []
+    for low, high in zip(lows[good], highs[good], strict=True):
+        if spans and low - spans[-1][1] <= high - low + spans[-1][2]:
+            spans[-1] = (spans[-1][0], high, spans[-1][2] + high - low)
+        else:
+            spans.append((low, high, high - low))
+    if not spans:
+        return np.zeros(len(along), bool)
+    low, high, _ = max(spans, key=lambda span: span[2])
+    return (along >= low) & (along <= high)

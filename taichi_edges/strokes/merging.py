@@ -1,0 +1,214 @@
+"""Pieces that continue each other become one edge: a line, an arc, or a free curve where neither describes them.
+
+Whether they do is decided as everywhere here: squared residuals in units of the points' noise plus the price of the
+free parameters, ln n each (BIC). Two pieces of one line pay one price instead of two; a hyperbola that was claimed by
+several arcs is one cubic; a fillet between two lines stays three edges, because no cubic follows all three.
+"""
+
+import heapq
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from taichi_edges.fitting.arcs import Arc, fit_arc
+from taichi_edges.fitting.cubic_chains import Ordering, fit_chain, nearest_on_chain
+from taichi_edges.fitting.prices import CUBIC_PRICE, MOST_CUBICS, NEXT_CUBIC_PRICE, price
+from taichi_edges.strokes.arc_growth import INLIER, SAGITTA, sagitta
+from taichi_edges.strokes.claiming import OUTLIER
+
+WIDE = 4.0  # times the tolerance: the first fit to two pieces starts from one of them, and looks farther
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A part of an edge, or all of it.
+
+    arc: Arc, or None for a free curve. curves: (c, 4, 3) control points of a free curve, in order; None for an arc.
+    own, shared: indices of its points. along: arc lengths or chain parameters of own and then shared. cost: BIC.
+    """
+
+    arc: Arc | None
+    curves: np.ndarray | None
+    own: np.ndarray
+    shared: np.ndarray
+    along: np.ndarray
+    cost: float
+
+    @property
+    def members(self):
+        """All of its points."""
+        return np.concatenate([self.own, self.shared])
+
+    @property
+    def closed(self):
+        """Has it no ends?"""
+        return self.arc is not None and self.arc.closed
+
+    @property
+    def cubics(self):
+        """How many cubics describe it."""
+        if self.arc is None:
+            return len(self.curves)
+        return max(int(np.ceil(self.arc.length * self.arc.curvature / (0.5 * np.pi))), 1)
+
+    def ends(self):
+        """(2, 3) its two ends, and (2, 3) the tangents there, both pointing outwards."""
+        if self.arc is not None:
+            at = np.array([self.arc.low, self.arc.high])
+            return self.arc.at(at), self.arc.tangents(at) * np.array([[-1.0], [1.0]])
+        places = np.stack([self.curves[0, 0], self.curves[-1, 3]])
+        tangents = np.stack([self.curves[0, 0] - self.curves[0, 1], self.curves[-1, 3] - self.curves[-1, 2]])
+        return places, tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-300)
+
+    def lengths(self):
+        """Arc lengths of its points, at least in order of size; and (2,) those of its ends."""
+        if self.arc is not None:
+            return self.along, np.array([self.arc.low, self.arc.high])
+        scale = np.linalg.norm(np.diff(self.curves, axis=1), axis=2).sum() / len(self.curves)
+        return self.along * scale, np.array([0.0, len(self.curves)]) * scale
+
+
+def merged(cloud, claims, noises):
+    """Pieces of whole edges from Claims, see `claiming`.
+
+    cloud: Cloud. noises: (n,) at which each point was claimed, unit-cube units.
+    """
+    cloud = cloud.with_noises(noises)
+    pieces = {number: piece_of(cloud, claim.arc, claim.own, claim.shared) for number, claim in enumerate(claims)}
+    waiting, turns, count, ends = [], itertools.count(), len(pieces), EndGrid(cloud.scale.gap)
+
+    def propose(some):
+        for number in some:
+            ends.add(number, pieces[number])
+        for a, b in joints(cloud, pieces, ends, some):
+            gain, piece = joined(cloud, pieces[a[0]], pieces[b[0]], a[1], b[1])
+            if gain > 0:
+                heapq.heappush(waiting, (-gain, a[0], b[0], next(turns), piece))
+
+    propose(list(pieces))
+    while waiting:
+        _, a, b, _, piece = heapq.heappop(waiting)
+        if a in pieces and b in pieces:
+            del pieces[a], pieces[b]
+            pieces[count] = piece
+            count += 1
+            propose([count - 1])
+    return [pieces[number] for number in sorted(pieces)]
+
+
+def piece_of(cloud, arc, own, shared):
+    """The Piece of an arc and its points."""
+    members = np.concatenate([own, shared])
+    along, offsets = arc.coordinates(cloud.points[members])
+    cost = capped((offsets**2).sum(axis=1), cloud.noises[members]) + price(arc) * np.log(len(members))
+    return Piece(arc, None, own, shared, along, cost)
+
+
+def capped(squared, noises):
+    """Sum of (n,) squared distances in units of the noises, (n,), each at most OUTLIER."""
+    return float(np.minimum(squared / noises**2, OUTLIER).sum())
+
+
+class EndGrid:
+    """The ends of open pieces in cubes of side `reach`: which are near an end is asked again after every joining."""
+
+    def __init__(self, reach):
+        self.reach, self.ends, self.cells = reach, {}, {}
+
+    def add(self, number, piece):
+        """Add the two ends of a Piece of some number, if it has any."""
+        if not piece.closed:
+            for side, (place, tangent) in enumerate(zip(*piece.ends(), strict=True)):
+                self.ends[number, side] = place, tangent
+                self.cells.setdefault(self._cell(place), []).append((number, side))
+
+    def near(self, end):
+        """Ends (number, side) within reach of one of them, itself included."""
+        place = self.ends[end][0]
+        corner = np.array(self._cell(place)) - 1
+        cells = (tuple(cell) for cell in (corner + np.indices((3, 3, 3)).reshape(3, -1).T).tolist())
+        around = [other for cell in cells for other in self.cells.get(cell, ())]
+        apart = np.linalg.norm([self.ends[other][0] - place for other in around], axis=1)
+        return [other for other, distance in zip(around, apart, strict=True) if distance <= self.reach]
+
+    def _cell(self, place):
+        return tuple(np.floor(place / self.reach).astype(int).tolist())
+
+
+def joints(cloud, pieces, grid, some):
+    """Pairs of ends that are near and look at each other, each (number of the piece, 0 or 1); one of them in `some`.
+
+    grid: EndGrid of all pieces, and of some that are gone.
+    """
+    found = set()
+    for end in [(number, side) for number in some if not pieces[number].closed for side in (0, 1)]:
+        for other in grid.near(end):
+            facing = grid.ends[end][1] @ grid.ends[other][1] <= -cloud.scale.cosine
+            if other[0] != end[0] and other[0] in pieces and facing:
+                found.add((min(end, other), max(end, other)))
+    return sorted(found)
+
+
+def joined(cloud, a, b, end_a, end_b):
+    """What it gains to make two pieces one, and that Piece; 0 and None where it does not pay."""
+    own = np.union1d(a.own, b.own)
+    shared = np.setdiff1d(np.union1d(a.shared, b.shared), own)
+    found = [free_piece(cloud, a, b, end_a, end_b, own, shared)]
+    if a.arc is not None and b.arc is not None:
+        longer = a.arc if a.arc.length >= b.arc.length else b.arc
+        found += [arc_piece(cloud, longer, own, shared, straight) for straight in (True, False)]
+    best = min((piece for piece in found if piece is not None), key=lambda piece: piece.cost, default=None)
+    gain = a.cost + b.cost - best.cost if best is not None else 0.0
+    return (gain, best) if gain > 0 else (0.0, None)
+
+
+def arc_piece(cloud, start, own, shared, straight):
+    """The points of two pieces as one line or arc; None where it bends too little for an arc."""
+    members, scale = np.concatenate([own, shared]), cloud.scale
+    points, directions, noises = cloud.points[members], cloud.directions[members], cloud.noises[members]
+    shares = (noises.min() / noises) ** 2
+    for tolerance in (WIDE * INLIER, INLIER):
+        start = fit_arc(start, points, directions, 0.0, tolerance * noises.max(), straight, shares=shares)
+    along, offsets = start.coordinates(points)
+    good = (offsets**2).sum(axis=1) <= OUTLIER * noises**2
+    if good.sum() < 2:
+        return None
+    arc = start.over(along[good].min(), along[good].max())
+    if arc.length + scale.gap >= arc.round:
+        arc = arc.over(arc.low, arc.low + arc.round)
+    if not straight and sagitta(arc) < SAGITTA * noises.min():
+        return None
+    return piece_of(cloud, arc.recentred(), own, shared)
+
+
+def free_piece(cloud, a, b, end_a, end_b, own, shared):
+    """The points of two pieces as a smooth chain of as few cubics as pay; see `joined`."""
+    members = np.concatenate([own, shared])
+    points, noises = cloud.points[members], cloud.noises[members]
+    ordering = chained(cloud, a, b, end_a, end_b, members)
+    best, most = None, min(a.cubics + b.cubics, MOST_CUBICS)
+    for cubics in range(1, most + 1):
+        if len(points) < 6 * cubics:
+            break
+        curves, _ = fit_chain(points, ordering, INLIER * noises.max(), cubics)
+        distances, along = nearest_on_chain(points, curves)
+        cost = (CUBIC_PRICE + NEXT_CUBIC_PRICE * (cubics - 1)) * np.log(len(points)) + capped(distances**2, noises)
+        if best is None or cost < best.cost:
+            best = Piece(None, curves, own, shared, along, cost)
+    return best
+
+
+def chained(cloud, a, b, end_a, end_b, members):
+    """Ordering of the members of two pieces: along the one to its end `end_a`, on from `end_b` along the other."""
+    (along_a, ends_a), (along_b, ends_b) = a.lengths(), b.lengths()
+    before = (along_a - ends_a[end_a]) * (1 if end_a else -1)
+    after = (along_b - ends_b[end_b]) * (-1 if end_b else 1)
+    (places_a, outwards), (places_b, _) = a.ends(), b.ends()
+    after = after + (places_b[end_b] - places_a[end_a]) @ outwards[end_a]
+    order = np.argsort(members, kind="stable")
+    arc = np.zeros(len(members))
+    for piece, along in ((b, after), (a, before)):
+        arc[order[np.searchsorted(members, piece.members, sorter=order)]] = along
+    arc -= arc.min()
+    return Ordering(arc, float(arc.max()), False)

@@ -1,0 +1,1 @@
+"""What every later room knows about the input: cameras, views, edgels, pictures."""
