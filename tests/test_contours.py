@@ -11,7 +11,7 @@ from taichi_edges.evidence.explaining import explain
 from taichi_edges.evidence.viewing_planes import refine_points
 from taichi_edges.scene.settings import FilterConfig
 from taichi_edges.strokes.assembly import ARC_NUMBERS, Assembly
-from taichi_edges.strokes.contours import CONTOUR_SHARE, evidence, steady_edges, without_contours
+from taichi_edges.strokes.contours import CONTOUR_SHARE, likelihood_ratio, steady_edges, without_contours
 
 A = line([0.2, 0.3, 0.3], [0.8, 0.35, 0.4])
 RIM = arc([0.5, 0.5, 0.6], 0.25)
@@ -84,11 +84,13 @@ def test_a_line_whose_edgels_others_explain_is_none(generator):
 
 def test_evidence_grows_with_the_share_and_with_the_views():
     usual = CONTOUR_SHARE
-    assert evidence(0.0, 0.0, usual) == 0.0 and evidence(usual * 20, 20, usual) == pytest.approx(0.0, abs=1e-9)
-    assert evidence(3, 20, usual) == 0.0  # fewer than a contour has
-    assert evidence(8, 10, usual) > evidence(7, 10, usual)
-    assert evidence(16, 20, usual) == pytest.approx(2 * evidence(8, 10, usual))
-    assert evidence(2, 2, usual) == pytest.approx(-2 * np.log(usual), rel=1e-3)
+    assert likelihood_ratio(0.0, 0.0, usual) == 0.0 and likelihood_ratio(usual * 20, 20, usual) == pytest.approx(
+        0.0, abs=1e-9
+    )
+    assert likelihood_ratio(3, 20, usual) == 0.0  # fewer than a contour has
+    assert likelihood_ratio(8, 10, usual) > likelihood_ratio(7, 10, usual)
+    assert likelihood_ratio(16, 20, usual) == pytest.approx(2 * likelihood_ratio(8, 10, usual))
+    assert likelihood_ratio(2, 2, usual) == pytest.approx(-2 * np.log(usual), rel=1e-3)
 
 
 def test_the_assembly_is_left_without_contours(generator):

@@ -8,7 +8,7 @@ from edgel_scenes import CylinderContour, arc, line, pixel_of, views_of
 
 from taichi_edges.evidence.edge_support import (
     Claims,
-    Samples,
+    EdgeSamples,
     claims_of,
     evidence_of,
     spaced,
@@ -49,17 +49,17 @@ def test_samples_are_evenly_spaced():
     ellipse = EllipticArc(np.zeros(3), np.diag([0.5, 0.1, 0])[:2], 0.1, 2.5)
     uneven = Spline(np.array([[[0, 0, 0], [0.01, 0, 0], [0.02, 0, 0], [0.9, 0.5, 0]]]))
     for shape in (Line(np.array([START, END])), CIRCLE, ellipse, uneven):
-        samples = Samples.along([shape], 0.005)
+        samples = EdgeSamples.along([shape], 0.005)
         steps = np.linalg.norm(np.diff(samples.points, axis=0), axis=1)
         # the spline hardly moves at its start: its speed doubles from one of the 64 chords to the next
         assert np.ptp(steps) < 0.05 * steps.mean()
         assert samples.lengths.sum() == pytest.approx(shape.length)
     assert len(spaced(Line(np.array([START, START + 1e-6])), 0.005)) == 1
-    assert len(Samples.along([], 0.005)) == 0
+    assert len(EdgeSamples.along([], 0.005)) == 0
 
 
 def test_sums_are_by_edge():
-    samples = Samples.along([Line(np.array([START, END])), CIRCLE], 0.01)
+    samples = EdgeSamples.along([Line(np.array([START, END])), CIRCLE], 0.01)
     np.testing.assert_allclose(samples.sums(samples.lengths), [np.linalg.norm(END - START), CIRCLE.length])
     assert samples.sums(samples.points).shape == (2, 3)
 

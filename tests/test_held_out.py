@@ -12,14 +12,15 @@ from taichi_edges.detectors.ridges import trace_ridges
 from taichi_edges.errors import UserError
 from taichi_edges.evaluation.dense_curves import middle_samples
 from taichi_edges.evaluation.edgel_index import MOST_SINE, EdgelIndex
-from taichi_edges.evaluation.held_out import PLACE_PX, Sightings, held_out_metrics
+from taichi_edges.evaluation.held_out import PLACE_PX, Visibility, held_out_metrics
 from taichi_edges.evaluation.metrics import average_per_voxel, exact_polylines, point_metrics
-from taichi_edges.evaluation.projected_curves import Camera, Chords
+from taichi_edges.evaluation.projected_curves import Chords
 from taichi_edges.progress import Progress
 from taichi_edges.scene.scene_file import check_scene
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import Imperfections, render_edge_maps, ring_cameras
-from taichi_edges.synthetic.visibility import Samples, outward_directions, ray_scene, visible_from
+from taichi_edges.synthetic.visibility import LineSamples, outward_directions, ray_scene, visible_from
+from taichi_edges.views.cameras import Camera
 from taichi_edges.views.edgels import Edgels
 from taichi_edges.views.splitting import choose_held_out, split_views
 from taichi_edges.views.views import Views, pixel_size, read_views
@@ -141,13 +142,13 @@ def test_traces_are_even_in_the_image_and_on_the_curve(generator):
     position = np.interp(traces.travelled, chords.travelled, np.arange(len(chords) + 1))
     chord = np.minimum(position.astype(int), len(chords) - 1)
     points = chords.starts[chord] + (position - chord)[:, None] * (chords.ends - chords.starts)[chord]
-    pixels, _, inside = camera.project(points, points)
+    pixels, _, inside = camera.project_lines(points, points)
     np.testing.assert_allclose(pixels[inside], traces.pixels[inside], atol=1e-6)
     assert inside.mean() > 0.99  # a sample half a step from the border may round to the other side
     dense = 0.0
     for start, end in zip(chords.starts, chords.ends, strict=True):
         line = start + np.linspace(0, 1, 20001)[:, None] * (end - start)
-        pixels, _, inside = camera.project(line, line)
+        pixels, _, inside = camera.project_lines(line, line)
         both = inside[1:] & inside[:-1]
         dense += np.linalg.norm(np.diff(pixels, axis=0), axis=1)[both].sum()
     assert traces.lengths.sum() == pytest.approx(dense, rel=2e-3)  # steps across the border are missing in `dense`
@@ -187,12 +188,12 @@ def test_what_is_hidden_is_hardly_ever_judged(bracket):
     """Against ray casting. Where visibility ends between two views, nothing can be said: those are the exceptions."""
     part, training, held_out = bracket
     places, tangents, _ = Chords.of(exact_polylines(part.edges)).places(PLACE_PX * pixel_size(training))
-    sightings, scene = Sightings.of(places, tangents, training), ray_scene(part)
+    sightings, scene = Visibility.of(places, tangents, training), ray_scene(part)
     zeros = np.zeros(len(places), int)
-    samples = Samples(places, outward_directions(part, places, 0.001), zeros, zeros)
+    samples = LineSamples(places, outward_directions(part, places, 0.001), zeros, zeros)
     visible, judged = [], []
     for view in range(len(held_out)):
-        centre = Camera.of(held_out, view).centre
+        centre = held_out.camera(view).centre
         visible.append(visible_from(scene, samples, centre))
         judged.append(sightings.judged_from(centre))
     visible, judged = np.concatenate(visible), np.concatenate(judged)

@@ -15,7 +15,6 @@ from taichi_edges.detectors.ridges import trace_ridges
 from taichi_edges.errors import UserError
 from taichi_edges.evaluation.dense_curves import dense_curves, middle_samples
 from taichi_edges.evaluation.metrics import evaluate, exact_polylines
-from taichi_edges.evaluation.projected_curves import Camera
 from taichi_edges.evaluation.pseudo_truth import Votes, points_in_box, pseudo_truth
 from taichi_edges.files.ply import read_vertices, write_float_vertices
 from taichi_edges.geometry.edge_set import write_edges
@@ -23,7 +22,7 @@ from taichi_edges.scene.scene_file import check_scene
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import Imperfections, pixel_size, render_edge_maps, ring_cameras
 from taichi_edges.synthetic.visibility import LIFT, ray_scene
-from taichi_edges.views.cameras import Similarity, invert_pose
+from taichi_edges.views.cameras import Camera, Similarity, invert_pose
 from taichi_edges.views.splitting import split_views
 from taichi_edges.views.views import Views, write_views
 

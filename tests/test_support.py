@@ -7,7 +7,7 @@ import pytest
 import reference_support as reference
 
 from taichi_edges.evidence import pixel_owners, support
-from taichi_edges.evidence.pixel_owners import Evidence
+from taichi_edges.evidence.pixel_owners import PixelOwners
 from taichi_edges.evidence.support import edge_strength, exclusive_support, line_width
 from taichi_edges.synthetic.rendering import ring_cameras
 from taichi_edges.views.drawing import draw_lines
@@ -136,7 +136,7 @@ def test_strength_is_that_of_the_slow_twin(taichi, generator):
     views = noise(generator)
     points = scattered(views, 400, generator)
     expected, seen = reference.edge_strength(views, points)
-    shown = Evidence(views, points.astype(np.float32), 0.5)
+    shown = PixelOwners(views, points.astype(np.float32), 0.5)
     np.testing.assert_array_equal(shown.seen, np.maximum(seen, 1))
     assert {0, 1, len(views)} <= set(seen.tolist())
     # A coordinate is off by some 1e-5 px in float32, and neighbouring pixels differ by up to 1.
@@ -151,7 +151,7 @@ def test_owned_shares_are_those_of_the_slow_twin(taichi, generator, claim_px):
     strength = generator.permutation(len(points)) // 2 / len(points)  # every value twice: the later point wins
     reach = 0.02
     expected = reference.owned_share(views, points, strength, 0.5, claim_px, reach)
-    shown = Evidence(views, points.astype(np.float32), 0.5)
+    shown = PixelOwners(views, points.astype(np.float32), 0.5)
     np.testing.assert_array_equal(shown.owned_share(strength, claim_px, reach), expected)
     assert 0 < expected.mean() < 0.5
 
@@ -159,12 +159,12 @@ def test_owned_shares_are_those_of_the_slow_twin(taichi, generator, claim_px):
 def test_batches_and_repeated_claims_do_not_change_the_support(taichi, generator, monkeypatch):
     views = noise(generator)
     points = scattered(views, 300, generator)
-    shown = Evidence(views, points.astype(np.float32), 0.5)
+    shown = PixelOwners(views, points.astype(np.float32), 0.5)
     assert len(shown.batches) == 1
     expected = reference.exclusive_support(views, points, 0.5, shown.strength)
     np.testing.assert_array_equal(exclusive_support(views, points, 0.5), expected)
     monkeypatch.setattr(pixel_owners, "BATCH_BYTES", 3 * 4 * (44 * 60 + len(points)))
-    assert len(Evidence(views, points.astype(np.float32), 0.5).batches) == 3
+    assert len(PixelOwners(views, points.astype(np.float32), 0.5).batches) == 3
     np.testing.assert_array_equal(exclusive_support(views, points, 0.5), expected)
     monkeypatch.setattr(pixel_owners, "LARGEST_I32", 4 * len(points))  # the claims start anew every third time
     np.testing.assert_array_equal(exclusive_support(views, points, 0.5), expected)

@@ -105,7 +105,7 @@ class Consensus:
             owners, found = (array[np.isfinite(flags[found])] for array in (owners, found))
             points, normals = self.points[owners], self.sides.outward[found]
             offsets = ((self.edgels.points[found] - self.views.project(points, view)[0]) * normals).sum(axis=1)
-            across_edge = np.einsum("ni,nij->nj", normals, derivatives(self.views, view, points))
+            across_edge = np.einsum("ni,nij->nj", normals, self.views.camera(view).slopes(points))
             slopes = self.pixel * np.einsum("nj,nkj->nk", across_edge, self.across[owners])
             return offsets, normals, flags[found], found, np.full(len(found), view), owners, slopes
 
@@ -224,20 +224,11 @@ def across(directions):
     return np.stack([first, np.cross(directions, first)], axis=1)
 
 
-def derivatives(views, view, points):
-    """(n, 2, 3): px that the projection of each point moves for a unit step along each axis of the world."""
-    lens, pose = views.intrinsics[view], views.world_to_camera[view]
-    homogeneous = (points @ pose[:, :3].T + pose[:, 3]) @ lens.T
-    depths = homogeneous[:, 2, None, None]
-    rows = lens @ pose[:, :3]
-    return (rows[None, :2] - homogeneous[:, :2, None] / depths * rows[2]) / depths
-
-
 def projected_normals(views, view, points, directions):
     """Projections (n, 2) and unit normals (n, 2) of the lines there, px; NaN where a line is seen end-on."""
     pixels, depths = views.project(points, view)
     safe = np.where((depths > NEAR)[:, None], points, np.nan)
-    along = np.einsum("nij,nj->ni", derivatives(views, view, safe), directions)
+    along = np.einsum("nij,nj->ni", views.camera(view).slopes(safe), directions)
     lengths = np.linalg.norm(along, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         long = lengths > LEAST_LENGTH * views.intrinsics[view, 0, 0] / depths

@@ -56,7 +56,7 @@ class Observations:
 
 
 @dataclass(frozen=True)
-class Fit:
+class OffsetFit:
     """What fits m observations best.
 
     values:        (3,) px: outward offset of silhouettes, shift in x and y.
@@ -84,7 +84,7 @@ class Estimate:
 
 
 def fit_offsets(observations, known, count=None):
-    """Fit of the observations. known: (3,) px values that are taken as they are, NaN where they are fitted.
+    """The OffsetFit of observations. known: (3,) px values that are taken as they are, NaN where they are fitted.
 
     count: number of 3D points, the owners, where there are any; their displacements are fitted too.
     """
@@ -95,7 +95,7 @@ def fit_offsets(observations, known, count=None):
         values, displacements, matrix = _solve(observations, weights * robust, known, count)
         residuals = _residuals(observations, values, displacements)
         robust = _weights(residuals, redescending=round_ >= ABSOLUTE_ROUNDS)
-    return Fit(values, displacements, residuals, weights * robust, robust, matrix)
+    return OffsetFit(values, displacements, residuals, weights * robust, robust, matrix)
 
 
 def standard_errors(observations, fit, known, points=None):

@@ -53,7 +53,6 @@ def _warn_of_chance(metrics, progress):
 def _ground_truth(run, views, held_out):
     """The GroundTruth of the scene, or None. views, held_out: Views that found its edges, and the others."""
     from taichi_edges.evaluation.ground_truth import read_ground_truth, read_sampled_ply
-    from taichi_edges.evaluation.projected_curves import Camera
     from taichi_edges.evaluation.pseudo_truth import Votes, points_in_box, pseudo_truth
 
     path, config, from_truth = truth_path(run), run.config.evaluation, np.linalg.inv(views.input_to_truth)
@@ -64,7 +63,7 @@ def _ground_truth(run, views, held_out):
     if path is None or config.kind != "scan":
         return read_ground_truth(path, to_unit) if path else None
     points = points_in_box(read_sampled_ply(path, to_unit).points, views.box, str(path))
-    cameras = {some.names[view]: Camera.of(some, view) for some in (views, held_out) for view in range(len(some))}
+    cameras = {some.names[view]: some.camera(view) for some in (views, held_out) for view in range(len(some))}
     maps = _scan_maps(run, views, held_out)
     with run.progress.track("scan", len(maps)) as report:
         votes = Votes.of(points, [cameras[name] for name in maps], maps.values(), config.scan.threshold, report)

@@ -57,7 +57,7 @@ HALF_SURE = 12.0  # ratio of an edge that gets the strength 0.5
 
 # BGR to opponent colours of equal noise: brightness, red against blue, green against both.
 OPPONENT = np.array([[1, 1, 1], [-(1.5**0.5), 0, 1.5**0.5], [-(0.5**0.5), 2**0.5, -(0.5**0.5)]], np.float32) / 3
-NEAR = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if down or right]
+RING = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if down or right]
 GAPS = [(down, right) for down in range(-2, 3) for right in range(-2, 3) if max(abs(down), abs(right)) == 2]
 
 
@@ -276,7 +276,7 @@ def _offsets(squares, rows, columns, normals):
     centre = rows * width + columns
     tiny = np.finfo(np.float32).tiny
     log = {
-        (down, right): np.log(flat[centre + down * width + right] + tiny) for down, right in [(0, 0), *NEAR]
+        (down, right): np.log(flat[centre + down * width + right] + tiny) for down, right in [(0, 0), *RING]
     }  # of the squares
     x, y = (log[0, 1] - log[0, -1]) / 2, (log[1, 0] - log[-1, 0]) / 2
     xx, yy = log[0, 1] - 2 * log[0, 0] + log[0, -1], log[1, 0] - 2 * log[0, 0] + log[-1, 0]
@@ -347,7 +347,7 @@ def _links(maxima, shape):
     place[maxima.rows, maxima.columns] = np.arange(count)
     costs, partners = np.full((2, count), np.inf, np.float32), np.full((2, count), -1)
     columns = [np.ascontiguousarray(column) for column in (*maxima.points.T, *maxima.normals.T)]
-    for ring in (NEAR, GAPS):
+    for ring in (RING, GAPS):
         lonely = np.flatnonzero((partners < 0).any(axis=0))
         centre = maxima.rows[lonely] * shape[1] + maxima.columns[lonely]
         for down, right in ring:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from taichi_edges.evaluation.edgel_index import MOST_SINE, EdgelIndex
-from taichi_edges.evaluation.projected_curves import Camera, Chords
+from taichi_edges.evaluation.projected_curves import Chords
 from taichi_edges.views.splitting import LEAST_LEFT
 from taichi_edges.views.views import pixel_size
 
@@ -30,14 +30,11 @@ ASIDE_PX = 12.0  # displacement at which agreement is chance: farther than edges
 ASIDE_EVERY = 4  # samples that are displaced: chance needs no more
 
 
-# ------------------------------------------------------------------------------------------ which views are held out
-
-
 # ------------------------------------------------------------------------------------------------------- visibility
 
 
 @dataclass(frozen=True)
-class Sightings:
+class Visibility:
     """What views show of some places on edges.
 
     places: (n, 3). inside, seen: (n, V) bool: the view has the place in its image; it has an edgel within REACH_PX.
@@ -56,8 +53,8 @@ class Sightings:
         inside, seen, matched = np.zeros((3, len(places), len(views)), bool)
         towards, chance = np.zeros((len(places), len(views), 3)), np.zeros(len(views))
         for view in range(len(views)):
-            camera, (points, normals, _) = Camera.of(views, view), views.edgels.of_view(view)
-            pixels, along, inside[:, view] = camera.project(places, tangents)
+            camera, (points, normals, _) = views.camera(view), views.edgels.of_view(view)
+            pixels, along, inside[:, view] = camera.project_lines(places, tangents)
             there = np.flatnonzero(inside[:, view])
             index = EdgelIndex.of(points, normals, views.width, views.height)
             at, _, away = index.agreeing(pixels[there], along[there], REACH_PX)
@@ -67,7 +64,7 @@ class Sightings:
             chance[view] = chance_of_match(points)
         expected, variance = inside @ chance, inside @ (chance * (1.0 - chance))
         enough = np.maximum(expected + SURE * np.sqrt(variance), LEAST_LEFT)
-        return Sightings(places, inside, seen, towards, matched.sum(axis=1) >= enough)
+        return Visibility(places, inside, seen, towards, matched.sum(axis=1) >= enough)
 
     def judged_from(self, centre):
         """(n,) bool: which places a view from `centre` (3,) ought to show, or are nowhere to be seen."""
@@ -126,14 +123,14 @@ def held_out_metrics(polylines, training, held_out):
     if len(held_out):
         spacing = max(PLACE_PX * pixel_size(training), chords.travelled[-1] / MOST_PLACES)
         places, tangents, ends = chords.places(spacing)
-        sightings = Sightings.of(places, tangents, training)
+        sightings = Visibility.of(places, tangents, training)
         scores = [score_view(chords, ends, sightings, held_out, view) for view in range(len(held_out))]
     return {"held_out_views": len(held_out), **metrics_of(scores)}
 
 
 def score_view(chords, ends, sightings, views, view):
     """Score of Chords in one of some Views. ends: (n,) where on the Chords the stretch of each place ends."""
-    camera, (points, normals, strengths) = Camera.of(views, view), views.edgels.of_view(view)
+    camera, (points, normals, strengths) = views.camera(view), views.edgels.of_view(view)
     index = EdgelIndex.of(points, normals, views.width, views.height)
     traces = chords.in_image(camera, SPACING_PX)
     place = np.minimum(np.searchsorted(ends, traces.travelled), len(ends) - 1)

@@ -12,8 +12,8 @@ import numpy as np
 
 from taichi_edges.evaluation.dense_curves import middle_samples
 from taichi_edges.evaluation.duplicates import DUPLICATE_COSINE
+from taichi_edges.evaluation.edge_graph import close_pairs
 from taichi_edges.evaluation.primitives import CORNER_DEGREES, JOINED, grouped
-from taichi_edges.evaluation.wireframe import close_pairs
 
 REACH = 0.005  # normalised units: EMAP's finest threshold; an edge that ends farther from a corner has missed it
 FOLLOWED_SHARE = 0.5  # of the shorter of the two edges; a line that runs past its fillet is parallel to 30 % of it
@@ -40,7 +40,7 @@ class Joint:
 
 
 def find_joints(truth):
-    """Wireframe of the true edges, each of one piece -> list of Joint; an end that meets no other edge is none."""
+    """EdgeGraph of the true edges, each of one piece -> list of Joint; an end that meets no other edge is none."""
     ends = truth.ends
     joints = []
     for group in grouped(len(ends.points), close_pairs(ends.points).tolist()):

@@ -17,8 +17,8 @@ import numpy as np
 from taichi_edges.errors import UserError
 from taichi_edges.evaluation.dense_curves import STEP
 from taichi_edges.evaluation.duplicates import duplicated_percent
+from taichi_edges.evaluation.edge_graph import edge_graph, free_ends
 from taichi_edges.evaluation.primitives import true_primitives
-from taichi_edges.evaluation.wireframe import free_ends, wireframe
 from taichi_edges.evaluation.wireframe_metrics import wireframe_metrics
 from taichi_edges.geometry.bezier import evaluate_bezier
 
@@ -41,7 +41,7 @@ def evaluate(edges, truth):
     sources = piece_sources(edges)
     true = true_wireframe(truth)
     metrics = count_metrics(edges, truth, sources, true) | length_metrics(edges, truth, sources)
-    metrics |= wireframe_metrics(wireframe(exact_polylines(edges), sources), true)
+    metrics |= wireframe_metrics(edge_graph(exact_polylines(edges), sources), true)
     return metrics | point_metrics(sample_prediction(edges), truth.points.astype(np.float32))
 
 
@@ -55,12 +55,12 @@ def measure_alone(edges):
         "edges": len(np.unique(sources)),
         "predicted_length_units": float(edges.lengths.sum()),
         "duplicated_length_percent": duplicated_percent(edges.polylines(), sources),
-        "free_ends": len(free_ends(wireframe(exact_polylines(edges), sources))),
+        "free_ends": len(free_ends(edge_graph(exact_polylines(edges), sources))),
     }
 
 
 def count_metrics(edges, truth, sources, true):
-    """How many pieces and edges there are. true: the Wireframe of the true primitives, or None."""
+    """How many pieces and edges there are. true: the EdgeGraph of the true primitives, or None."""
     count = len(np.unique(sources))
     return {
         "lines": len(edges.lines),
@@ -99,11 +99,11 @@ def exact_polylines(edges):
 
 
 def true_wireframe(truth):
-    """The Wireframe of the primitives of a GroundTruth; None where only samples are known."""
+    """The EdgeGraph of the primitives of a GroundTruth; None where only samples are known."""
     if not truth.curves:
         return None
     primitives = true_primitives(truth.curves, truth.kinds)
-    return wireframe(primitives, np.arange(len(primitives)))
+    return edge_graph(primitives, np.arange(len(primitives)))
 
 
 def refuse_unbounded(edges):

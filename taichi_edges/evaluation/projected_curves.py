@@ -4,8 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taichi_edges.views.cameras import NEAR
-
 
 @dataclass(frozen=True)
 class Chords:
@@ -71,46 +69,6 @@ class Chords:
         travelled = self.travelled[seen][chord] + share * np.diff(self.travelled)[seen][chord]
         along = vectors / np.maximum(lengths, 1e-300)[:, None]
         return Traces(pixels, along[chord], (lengths / counts)[chord], travelled)
-
-
-@dataclass(frozen=True)
-class Camera:
-    """One view. intrinsics: (3, 3) pixels. world_to_camera: (3, 4). width, height: pixels."""
-
-    intrinsics: np.ndarray
-    world_to_camera: np.ndarray
-    width: int
-    height: int
-
-    @staticmethod
-    def of(views, view):
-        """That of one of some Views."""
-        return Camera(views.intrinsics[view], views.world_to_camera[view], views.width, views.height)
-
-    @property
-    def centre(self):
-        """(3,) where it stands."""
-        return -self.world_to_camera[:, :3].T @ self.world_to_camera[:, 3]
-
-    @property
-    def planes(self):
-        """(5, 4): the homogeneous images (u d, v d, d, 1) that are in sight have no negative product with any."""
-        right, below = self.width - 0.5, self.height - 0.5
-        return np.array([[0, 0, 1, -NEAR], [1, 0, 0.5, 0], [-1, 0, right, 0], [0, 1, 0.5, 0], [0, -1, below, 0]])
-
-    def homogeneous(self, points):
-        """(n, 4): u d, v d, d and 1 of (n, 3) points at depth d."""
-        seen = (points @ self.world_to_camera[:, :3].T + self.world_to_camera[:, 3]) @ self.intrinsics.T
-        return np.column_stack([seen, np.ones(len(points))])
-
-    def project(self, points, directions):
-        """(n, 2) pixels of (n, 3) points, (n, 2) unit images of their directions, and whether they are in sight."""
-        seen, moved = self.homogeneous(points), directions @ (self.intrinsics @ self.world_to_camera[:, :3]).T
-        inside = (self.planes @ seen.T >= 0).all(axis=0)
-        depths = np.where(inside, seen[:, 2], 1.0)[:, None]
-        pixels = seen[:, :2] / depths
-        along = moved[:, :2] - pixels * moved[:, 2:]
-        return pixels, along / np.maximum(np.linalg.norm(along, axis=1), 1e-300)[:, None], inside
 
 
 @dataclass(frozen=True)

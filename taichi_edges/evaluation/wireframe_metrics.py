@@ -6,8 +6,8 @@ Points are no measure of these: three edges that stop 4 mm before their corner r
 import numpy as np
 
 from taichi_edges.evaluation.dense_curves import middle_samples
+from taichi_edges.evaluation.edge_graph import edge_graph, free_ends
 from taichi_edges.evaluation.joints import REACH, find_joints, followers, judge_joints
-from taichi_edges.evaluation.wireframe import free_ends, wireframe
 
 # In normalised units, EMAP's coarsest limit. Where a line turns into an arc of radius r, both are s^2 / 2r apart at the
 # distance s: 0.5 mm at 10 mm with r = 100 mm. So images tell less of the place of a contact than of a corner's.
@@ -18,8 +18,8 @@ UNIT_MM = 1000.0  # "mm" in one normalised unit
 
 
 def wireframe_metrics(predicted, truth):
-    """All the metrics of a predicted Wireframe. truth: that of the primitives, or None where only samples are known."""
-    known = truth if truth is not None else wireframe([], [])
+    """All the metrics of a predicted EdgeGraph. truth: that of the primitives, or None where only samples are known."""
+    known = truth if truth is not None else edge_graph([], [])
     metrics = joint_metrics(predicted, known) | exact_metrics(predicted, known)
     if truth is None:
         metrics = dict.fromkeys(metrics)
@@ -79,7 +79,7 @@ def exact_metrics(predicted, truth):
 
 
 def curve_distances(one, other):
-    """(n,) distances from samples along the one Wireframe to the nearest points of the other."""
+    """(n,) distances from samples along the one EdgeGraph to the nearest points of the other."""
     points = middle_samples(one.polylines, EXACT_SPACING)[0]
     return other.dense.distances(points)
 

@@ -12,6 +12,7 @@ from scipy.special import gammainc
 
 from taichi_edges.evidence.edgel_matching import MOST_SINE
 from taichi_edges.evidence.explaining import BEST_SUPPORTED, NOISE_PER_MEDIAN, TIGHT_NOISES, TIGHT_PX
+from taichi_edges.evidence.lying import EdgelsAbout, steadiness
 from taichi_edges.geometry.wireframe import Evidence
 
 SPACING_PX = 0.5  # of the samples of an edge; edgels are about 1 px apart, so that hardly one of them is missed
@@ -25,7 +26,7 @@ PLANES = 2  # those of two views always meet
 
 
 @dataclass(frozen=True)
-class Samples:
+class EdgeSamples:
     """Places at equal distances along each of some shapes, in the middle of the stretches they stand for.
 
     points, directions: (n, 3), unit vectors. edges: (n,) index of the shape. parameters: (n,) on it, see `shapes`.
@@ -45,7 +46,7 @@ class Samples:
         parameters = [spaced(shape, spacing) for shape in shapes]
         counts = np.array([len(some) for some in parameters], dtype=np.int64)
         pairs = list(zip(shapes, parameters, strict=True))
-        return Samples(
+        return EdgeSamples(
             np.concatenate([np.zeros((0, 3)), *(shape.at(some) for shape, some in pairs)]),
             np.concatenate([np.zeros((0, 3)), *(shape.tangents(some) for shape, some in pairs)]),
             np.repeat(np.arange(len(shapes)), counts),
@@ -112,13 +113,13 @@ class Claims:
 class Support:
     """The edgels of all views that are matched by the samples of some edges and owned by these.
 
-    samples: Samples. edgels: (n, V) index, -1 where there is none. residuals: (n, V) px. weights: (n, V) strength of
+    samples: EdgeSamples. edgels: (n, V) index, -1 where there is none. residuals: (n, V) px. weights: (n, V) strength of
     the edgel times closeness, that of Geman and McClure at the scale of the matching; 0 where there is none. claims:
     Claims. chance: sum of the weights that a place would have by chance. least_views: that must show an edge, each
     counted by its weight.
     """
 
-    samples: Samples
+    samples: EdgeSamples
     edgels: np.ndarray
     residuals: np.ndarray
     weights: np.ndarray
@@ -175,23 +176,23 @@ def support_of(matching, shapes, radius=MATCH_PX):
     The noise can make an edgel nearer to the wrong one of two edges, so an edge with fewer views on its length than the
     best one counts as farther away, by up to TIE_NOISES times the noise.
     """
-    samples = Samples.along(shapes, SPACING_PX * matching.pixel)
-    edgels, residuals = _matches(matching, samples.points, samples.directions, radius)
-    nearest = _owned(matching, samples, edgels, residuals, np.zeros(len(shapes)))
+    samples = EdgeSamples.along(shapes, SPACING_PX * matching.pixel)
+    found = EdgelsAbout.of(matching, samples.points, samples.directions, radius)
+    nearest = _owned(matching, samples, found, np.zeros(len(shapes)))
     strengths = samples.sums(nearest.views) / np.maximum(np.diff(samples.starts), 1)
     handicaps = TIE_NOISES * nearest.noise_px * (1.0 - strengths / max(strengths.max(initial=0.0), 1e-300))
-    return _owned(matching, samples, edgels, residuals, handicaps)
+    return _owned(matching, samples, found, handicaps)
 
 
-def _owned(matching, samples, edgels, residuals, handicaps):
-    """The Support of samples with all their matches. handicaps: (E,) px by which edges count as farther away."""
-    at, view = np.nonzero(edgels >= 0)
-    found, edges = edgels[at, view], samples.edges[at]
-    claims = Claims.of(len(matching.edgels), found, edges, np.abs(residuals[at, view]) + handicaps[edges])
-    lost, edgels = claims.owners[found] != edges, edgels.copy()
+def _owned(matching, samples, about, handicaps):
+    """The Support of samples with all EdgelsAbout them. handicaps: (E,) px by which edges count as farther away."""
+    at, view = np.nonzero(about.there)
+    found, edges = about.edgels[at, view], samples.edges[at]
+    claims = Claims.of(len(matching.edgels), found, edges, np.abs(about.residuals[at, view]) + handicaps[edges])
+    lost, edgels = claims.owners[found] != edges, about.edgels.copy()
     edgels[at[lost], view[lost]] = -1
-    weights = _weights(matching, edgels, residuals)
-    return Support(samples, edgels, residuals, weights, claims, chance_weight(matching), matching.least_views)
+    weights = _weights(matching, edgels, about.residuals)
+    return Support(samples, edgels, about.residuals, weights, claims, chance_weight(matching), matching.least_views)
 
 
 def evidence_of(support):
@@ -210,28 +211,26 @@ def evidence_of(support):
     return [Evidence(int(views), *map(float, rest)) for views, *rest in columns]
 
 
-def steadiness(matching, support):
+def steadiness_of_edges(matching, support):
     """(E,) share of the edgels about each edge that lie on it, of those that no other edge owns.
 
-    An edge stays where it is as the viewpoint moves. The occluding contour of a smooth surface leaves any line in
-    space, so that its edgels lie all around. matching: EdgelMatching. support: Support of the edges.
+    matching: EdgelMatching. support: Support of the edges.
     """
     samples, tight = support.samples, max(TIGHT_PX, TIGHT_NOISES * support.noise_px)
     about = min(ABOUT * tight, MOST_ABOUT_PX)
-    views = slice(0, matching.edgels.view_count)
-    edgels, residuals, _ = matching.matches(samples.points, samples.directions, views, about)
-    at, view = np.nonzero(edgels >= 0)
-    owners = support.claims.owners[edgels[at, view]]
+    found = EdgelsAbout.of(matching, samples.points, samples.directions, about)
+    at, view = np.nonzero(found.there)
+    owners = support.claims.owners[found.edgels[at, view]]
     mine = (owners < 0) | (owners == samples.edges[at])
-    on = mine & (np.abs(residuals[at, view]) <= tight)
+    on = mine & found.within(tight)[at, view]
     numbers, count = samples.edges[at], len(samples.starts) - 1
-    return np.bincount(numbers[on], minlength=count) / np.maximum(np.bincount(numbers[mine], minlength=count), 1)
+    return steadiness(*(np.bincount(numbers[some], minlength=count) for some in (on, mine)))
 
 
 def support_share(matching, support):
     """(E,) number of views that support each edge, each counted by its weight, of those that have it in their image."""
-    samples, views = support.samples, slice(0, matching.edgels.view_count)
-    inside = matching.matches(samples.points, samples.directions, views, MATCH_PX)[2].sum(axis=1)
+    samples = support.samples
+    inside = EdgelsAbout.of(matching, samples.points, samples.directions, MATCH_PX).inside.sum(axis=1)
     return samples.sums(support.views) / np.maximum(samples.sums(inside), 1)
 
 
@@ -259,13 +258,14 @@ def support_of_places(matching, places, claims=None, owns=()):
     points = np.concatenate([shape.at(parameters) for shape, parameters in places])
     directions = np.concatenate([shape.tangents(parameters) for shape, parameters in places])
     counts = np.array([len(parameters) for _, parameters in places])
-    edgels, residuals = _matches(matching, points, directions, MATCH_PX)
+    found = EdgelsAbout.of(matching, points, directions, MATCH_PX)
+    edgels = found.edgels
     if claims is not None:
-        at, view = np.nonzero(edgels >= 0)
+        at, view = np.nonzero(found.there)
         others = claims.beside(np.repeat(owns, counts)[at], edgels[at, view])
-        lost = np.abs(residuals[at, view]) + TIE_PX >= others
+        lost = np.abs(found.residuals[at, view]) + TIE_PX >= others
         edgels[at[lost], view[lost]] = -1
-    views = _weights(matching, edgels, residuals).sum(axis=1)
+    views = _weights(matching, edgels, found.residuals).sum(axis=1)
     return np.split(views, np.cumsum(counts)[:-1])
 
 
@@ -280,13 +280,6 @@ def chance_weight(matching):
     for strengths, area in matching.densities:
         total += float(strengths * width * turned / area)
     return total
-
-
-def _matches(matching, points, directions, radius):
-    """(n, V) edgels, -1 where there is none within so many px, and residuals of places in all views."""
-    count = matching.edgels.view_count
-    edgels, residuals, _ = matching.matches(points, directions, slice(0, count), radius)
-    return edgels, residuals
 
 
 def _weights(matching, edgels, residuals):

@@ -38,6 +38,11 @@ class EdgelMatching:
         self.size = views.height, views.width
         self.cameras = upload((views.intrinsics @ views.world_to_camera).astype(np.float32))
 
+    @property
+    def projections(self):
+        """(V, 3, 4) intrinsics @ world_to_camera, rounded to float32 as the kernels have them."""
+        return download(self.cameras).astype(np.float64)
+
     @cached_property
     def neighbors(self):
         """(n, OWNED_MOST) indices of the edgels before and after each on its 2D edge, itself included and repeated."""

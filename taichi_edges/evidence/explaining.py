@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taichi_edges.evidence.lying import EdgelsAbout, steadiness
+
 ROUNDS = 4  # owners whose own support turns out weak lose their edgels in the next round
 MATCH_PX = 1.0  # a point explains an edgel within this distance
 NEAR_PX = 3.0  # an edgel within this distance, and nobody else's, should lie on the point if that is on an edge
@@ -57,15 +59,15 @@ def explain(matching, refined):
     for _ in range(ROUNDS):
         owners = _owners(matching, refined, owned + 1e-3 * refined.support)
         shared, seen = np.zeros(count), np.zeros(count)
-        for some, matches, _, inside in _in_parts(matching, refined, MATCH_PX):
-            shared += (_whose(matching, refined, owners, some, matches, beside) > 0).sum(axis=1)
-            seen += inside.sum(axis=1)
+        for part in _in_parts(matching, refined, MATCH_PX):
+            shared += (_whose(matching, refined, owners, part.edgels, beside) > 0).sum(axis=1)
+            seen += part.inside.sum(axis=1)
         owned = shared / np.maximum(seen, 1)
     best = _best(owned)
     noise = _noise(matching, refined.keep(best))
-    steadiness = _steadiness(matching, refined, owners, max(TIGHT_PX, TIGHT_NOISES * noise), beside)
-    usual = max(float(np.median(steadiness[best])), LEAST_USUAL) if count else 1.0
-    return Explained(owned, steadiness / usual, refined.spread, noise)
+    share = _steadiness_of_points(matching, refined, owners, max(TIGHT_PX, TIGHT_NOISES * noise), beside)
+    usual = max(float(np.median(share[best])), LEAST_USUAL) if count else 1.0
+    return Explained(owned, share / usual, refined.spread, noise)
 
 
 def _best(support):
@@ -79,11 +81,11 @@ def unexplained(matching, refined):
 
 
 def _in_parts(matching, refined, radius):
-    """(slice of the views, matches, residuals, inside) of `EdgelMatching.matches`, some views at a time."""
+    """EdgelsAbout the RefinedPoints, some views at a time."""
     count = matching.edgels.view_count
     for first in range(0, count, VIEWS_AT_ONCE):
         some = slice(first, min(first + VIEWS_AT_ONCE, count))
-        yield some, *matching.matches(refined.points, refined.directions, some, radius)
+        yield EdgelsAbout.of(matching, refined.points, refined.directions, radius, some)
 
 
 def _owners(matching, refined, strength):
@@ -92,14 +94,14 @@ def _owners(matching, refined, strength):
     ranks = np.empty(len(refined), np.int64)
     ranks[order] = np.arange(len(refined))
     best = np.full(len(matching.edgels), -1)
-    for _, matches, _, _ in _in_parts(matching, refined, MATCH_PX):
-        at, column = np.nonzero(matches >= 0)
-        np.maximum.at(best, matches[at, column], ranks[at])
+    for part in _in_parts(matching, refined, MATCH_PX):
+        at, column = np.nonzero(part.there)
+        np.maximum.at(best, part.edgels[at, column], ranks[at])
     best = best[matching.neighbors].max(axis=1, initial=-1)
     return np.append(order, -1)[best]
 
 
-def _whose(matching, refined, owners, some, matches, beside):
+def _whose(matching, refined, owners, matches, beside):
     """(n, v) int: 1 where the matched edgel is the point's own, -1 where it is another edge's, 0 no edgel or owner.
 
     beside: px; so far across its direction another point is on the same edge.
@@ -118,16 +120,16 @@ def _whose(matching, refined, owners, some, matches, beside):
 
 def _noise(matching, best):
     """Standard deviation, px, of the residuals of the `best` points."""
-    residuals = [found[matches >= 0] for _, matches, found, _ in _in_parts(matching, best, MATCH_PX)]
+    residuals = [part.residuals[part.there] for part in _in_parts(matching, best, MATCH_PX)]
     residuals = np.concatenate([np.zeros(0), *residuals])
     return float(NOISE_PER_MEDIAN * np.median(np.abs(residuals))) if len(residuals) else 0.0
 
 
-def _steadiness(matching, refined, owners, tight, beside):
+def _steadiness_of_points(matching, refined, owners, tight, beside):
     """(n,) see Explained, not yet relative. tight, beside: px."""
-    on, near = np.zeros(len(refined)), np.zeros(len(refined))
-    for some, matches, residuals, _ in _in_parts(matching, refined, NEAR_PX):
-        counted = (matches >= 0) & (_whose(matching, refined, owners, some, matches, beside) >= 0)
-        near += counted.sum(axis=1)
-        on += (counted & (np.abs(residuals) <= tight)).sum(axis=1)
-    return on / np.maximum(near, 1)
+    on, about = np.zeros(len(refined)), np.zeros(len(refined))
+    for part in _in_parts(matching, refined, NEAR_PX):
+        counted = part.there & (_whose(matching, refined, owners, part.edgels, beside) >= 0)
+        about += counted.sum(axis=1)
+        on += (counted & part.within(tight)).sum(axis=1)
+    return steadiness(on, about)

@@ -29,7 +29,7 @@ BATCH_BYTES = 16 << 20  # images and pixel lists of the views that are worked on
 LARGEST_I32 = 2**31 - 1
 
 
-class Evidence:
+class PixelOwners:
     """What the edge maps show at the projections of some points, and the memory to find out which point owns what.
 
     The views are worked on in batches, so that the memory stays bounded: n / 8 bytes a view beyond BATCH_BYTES.

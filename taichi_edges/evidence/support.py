@@ -23,12 +23,12 @@ def edge_strength(views, points):
 
     Over the views that have the point in front of the camera and inside the image; bilinear; 0 where there is none.
     """
-    from taichi_edges.evidence.pixel_owners import Evidence
+    from taichi_edges.evidence.pixel_owners import PixelOwners
 
     strength = np.zeros(len(points))
     points, finite = _finite(points)
     if len(points):
-        strength[finite] = Evidence(views, points, 0.5).strength
+        strength[finite] = PixelOwners(views, points, 0.5).strength
     return strength
 
 
@@ -67,13 +67,13 @@ def exclusive_support(views, points, threshold):
     from those views. Strength is the mean map value first, then the support found in the round before.
     Returns (n,) in 0..1, relative to the views that have the point in front of the camera and inside the image.
     """
-    from taichi_edges.evidence.pixel_owners import Evidence
+    from taichi_edges.evidence.pixel_owners import PixelOwners
 
     support = np.zeros(len(points))
     points, finite = _finite(points)
     if len(points):
         width_px, width = line_width(views, threshold)
-        evidence = Evidence(views, points, threshold)
+        evidence = PixelOwners(views, points, threshold)
         owned = evidence.strength
         for _ in range(OWNER_ROUNDS):
             owned = evidence.owned_share(owned + 1e-3 * evidence.strength, CLAIM * width_px, SAME_EDGE * width)

@@ -72,7 +72,7 @@ def best_shape(track, yardstick, count, worth=np.inf):
     count: number of observations of all that is compared.
     """
     best, least = None, worth
-    for price, fit in candidates(track, yardstick):
+    for price, fit in shape_candidates(track, yardstick):
         if price * np.log(count) >= least:
             continue
         shape = fit()
@@ -83,7 +83,7 @@ def best_shape(track, yardstick, count, worth=np.inf):
     return best, least if best is not None else np.inf
 
 
-def candidates(track, yardstick):
+def shape_candidates(track, yardstick):
     """Pairs of a price, and a function that fits a shape of at least that price, or None where there is none."""
     tolerance = 3.0 * yardstick.noise
     found = [] if track.closed else [(PRICES["line"], lambda: fitted_line(track, tolerance).shape())]

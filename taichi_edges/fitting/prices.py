@@ -7,7 +7,7 @@ CUBIC_PRICE, NEXT_CUBIC_PRICE = 12, 6  # of a cubic, and of one more in a smooth
 MOST_CUBICS = 4  # of an open chain
 
 
-def price(arc):
+def price_of_arc(arc):
     """Free parameters of a line or an arc with its ends."""
     return LINE_PRICE if arc.curvature == 0 else ARC_PRICE
 

@@ -12,7 +12,7 @@ from taichi_edges.progress import Progress
 from taichi_edges.readers.photogrammetry import undistorted
 from taichi_edges.readers.scene_checks import (
     LEAVE_OUT,
-    Cameras,
+    CamerasAsRead,
     check_box,
     check_places,
     check_points,
@@ -179,10 +179,10 @@ def frames_in_sight(frames, config, box, progress):
 
 
 def _cameras(frames, intrinsics, sizes, axes):
-    """The Cameras of frames. sizes: (V, 2) width and height, pixels. axes: `source.axes`."""
+    """The CamerasAsRead of frames. sizes: (V, 2) width and height, pixels. axes: `source.axes`."""
     opengl = frames.opengl if axes == "auto" else axes == "opengl"
     poses = camera_poses(frames)
-    return Cameras(intrinsics, poses @ OPENGL_TO_OPENCV if opengl else poses, np.asarray(sizes), opengl)
+    return CamerasAsRead(intrinsics, poses @ OPENGL_TO_OPENCV if opengl else poses, np.asarray(sizes), opengl)
 
 
 def _check_scene(frames, cameras, box, progress):
@@ -194,7 +194,7 @@ def _check_scene(frames, cameras, box, progress):
 
 
 def _cameras_before_detection(frames, config):
-    """The Cameras of frames of which no picture is decoded; None where no picture tells a size."""
+    """The CamerasAsRead of frames of which no picture is decoded; None where no picture tells a size."""
     common, intrinsics, sizes = _size_of_a_picture(frames), [], []
     for lens, intrinsics_for in zip(frames.lenses, frames.intrinsics, strict=True):
         if lens is None and common is None:

@@ -25,7 +25,7 @@ LEAVE_OUT = "or leave such views out with source.skip"
 
 
 @dataclass(frozen=True)
-class Cameras:
+class CamerasAsRead:
     """intrinsics: (V, 3, 3) pixels. poses: (V, 4, 4) camera-to-world, OpenCV axes, input units. sizes: (V, 2) width and
     height, pixels. opengl: whether they were read with OpenGL axes."""
 

@@ -14,9 +14,11 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from taichi_edges.evidence.edge_support import support_of
+from taichi_edges.evidence.lying import EdgelsAbout
 from taichi_edges.geometry.shapes import Line
-from taichi_edges.refinement.anchors import BEYOND_PX, Cameras, anchors_of, ragged
+from taichi_edges.refinement.anchors import BEYOND_PX, anchors_of, ragged
 from taichi_edges.refinement.straight_runs import LEAST_LENGTH_PX, runs_of
+from taichi_edges.views.cameras import Cameras
 
 AGREEING_PX = 2.0  # from a line in space, an anchor on it
 APART_SHARE = 0.5  # of a run's length: anchors nearer to each other do not tell its slope in depth
@@ -41,7 +43,7 @@ def anchored_lines(matching, shapes):
     """
     if not shapes:
         return []
-    cameras, support = Cameras.of(matching), support_of(matching, shapes)
+    cameras, support = Cameras.of(matching.projections), support_of(matching, shapes)
     runs, known = runs_of(matching.edgels, support.claims.owners < 0), list(shapes)
     anchors = anchors_of(runs, known, cameras, matching.pixel)
     for number in range(ROUNDS):
@@ -53,12 +55,6 @@ def anchored_lines(matching, shapes):
         anchors = anchors.joined(anchors_of(runs, found, cameras, matching.pixel), len(known))
         known += found
     return known[len(shapes) :]
-
-
-# --------------------------------------------------------------------------------------------------------- cameras
-
-
-# --------------------------------------------------------------------------------------------------------- anchors
 
 
 # ------------------------------------------------------------------------------------------------- lines in space
@@ -202,8 +198,9 @@ class Sight:
         way = lines.ways[owners]
         points = lines.points[owners, 0] + parameters[:, None] * way
         way = way / np.linalg.norm(way, axis=1, keepdims=True)
-        edgels, _, seen = matching.matches(points, way, slice(0, matching.edgels.view_count), SHOWN_PX)
-        return Sight(owners, parameters, np.where(np.append(free, False)[edgels], edgels, -1), seen)
+        about = EdgelsAbout.of(matching, points, way, SHOWN_PX)
+        edgels = np.where(np.append(free, False)[about.edgels], about.edgels, -1)
+        return Sight(owners, parameters, edgels, about.inside)
 
     def shares(self, count):
         """(L, V) share of the places of each of the lines that a view has and shows; of them all."""

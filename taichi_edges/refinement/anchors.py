@@ -5,36 +5,10 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from taichi_edges.kernels.device import download
-from taichi_edges.views.cameras import NEAR
-
 BEYOND_PX = 8.0  # between the ends of edges that meet, see `junctions.REACH_PX`
 LEAST_CROSSING = 0.3  # sine of the angle in the image at which an anchor is met
 PLACE_PX, SHAPE_PX = 4.0, 1.5  # spacing of the places on runs and on shapes
 CLOSE_PX = 6.0  # where such places are so near, runs may meet shapes
-
-
-@dataclass(frozen=True)
-class Cameras:
-    """matrices: (V, 3, 4) point -> homogeneous pixel. centres: (V, 3). focal: (V,) px."""
-
-    matrices: np.ndarray
-    centres: np.ndarray
-    focal: np.ndarray
-
-    @staticmethod
-    def of(matching):
-        """Those of an EdgelMatching."""
-        matrices = download(matching.cameras).astype(np.float64)
-        centres = -np.linalg.solve(matrices[:, :, :3], matrices[:, :, 3:])[:, :, 0]
-        return Cameras(matrices, centres, np.sqrt(np.abs(np.linalg.det(matrices[:, :, :3]))))
-
-    def project(self, points, views):
-        """Pixels (n, 2), NaN behind the camera, and depths (n,) of points (n, 3), each in its own view (n,)."""
-        matrices = self.matrices[views]
-        homogeneous = np.einsum("nij,nj->ni", matrices[:, :, :3], points) + matrices[:, :, 3]
-        depths = homogeneous[:, 2]
-        return homogeneous[:, :2] / np.where(depths > NEAR, depths, np.nan)[:, None], depths
 
 
 @dataclass(frozen=True)

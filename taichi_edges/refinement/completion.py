@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from taichi_edges.evidence.edge_support import claims_of, support_along
+from taichi_edges.evidence.lying import EdgelsAbout, steadiness
 from taichi_edges.fitting.distances import distances_to
 from taichi_edges.geometry.shapes import Line, bounds_of, near_bounds
 from taichi_edges.geometry.wireframe import Edge, Wireframe
@@ -31,7 +32,9 @@ def completed(wireframe, matching):
         line = Line(wireframe.vertices[[first, second]])
         places = clear_places(line, matching.pixel)
         views = support_along(matching, line, places, claims)
-        if (views >= matching.least_views).mean() >= SHOWN and steadiness(matching, line, places, claims) >= STEADY:
+        if (views >= matching.least_views).mean() >= SHOWN and steadiness_of_line(
+            matching, line, places, claims
+        ) >= STEADY:
             found.append((float(views.mean()), first, second))
     edges = list(wireframe.edges)
     for _, first, second in sorted(found, reverse=True):
@@ -50,15 +53,14 @@ def repeats(line, shapes, pixel):
     return any((distances_to(shapes[number], places) <= pixel).all() for number in near)
 
 
-def steadiness(matching, line, places, claims):
+def steadiness_of_line(matching, line, places, claims):
     """Share of the edgels about a line, of those that nothing else explains, that lie on it.
 
     A chord across a rounded corner is followed by the occluding contour in some views, and missed by it in others.
     """
-    views = slice(0, matching.edgels.view_count)
-    edgels, residuals, _ = matching.matches(line.at(places), line.tangents(places), views, ABOUT_PX)
-    free = np.append(claims.owners < 0, False)[edgels]
-    return (free & (np.abs(residuals) <= ON_PX)).sum() / max(free.sum(), 1)
+    found = EdgelsAbout.of(matching, line.at(places), line.tangents(places), ABOUT_PX)
+    free = np.append(claims.owners < 0, False)[found.edgels]
+    return steadiness((free & found.within(ON_PX)).sum(), free.sum())
 
 
 def open_pairs(wireframe, pixel):

@@ -197,7 +197,7 @@ def smooth_paths(shapes, yardstick, pixel, gap_px):
 
     Every shape is in one of them.
     """
-    partner = joints(shapes, yardstick, pixel, gap_px)
+    partner = stroke_joints(shapes, yardstick, pixel, gap_px)
     paths, seen = [], set()
     ends = [(number, side) for number, shape in enumerate(shapes) for side in (0, 1)]
     starts = [end for end in ends if end not in partner] + ends  # open paths first, then what goes round
@@ -214,7 +214,7 @@ def smooth_paths(shapes, yardstick, pixel, gap_px):
     return paths
 
 
-def joints(shapes, yardstick, pixel, gap_px):
+def stroke_joints(shapes, yardstick, pixel, gap_px):
     """{(shape, side): (shape, side)} of ends that continue each other, each the best for the other."""
     ends = [(number, side) for number, shape in enumerate(shapes) if not shape.closed for side in (0, 1)]
     if len(ends) < 2:

@@ -8,7 +8,7 @@ import numpy as np
 from taichi_edges.evidence.edge_support import (
     claims_of,
     evidence_of,
-    steadiness,
+    steadiness_of_edges,
     support_along,
     support_of,
     support_of_places,
@@ -125,7 +125,7 @@ def is_edge(matching, support, shapes, config, lenience=1.0):
     enough = support.supported_lengths >= LEAST_SUPPORTED * np.array([shape.length for shape in shapes])
     if config.min_support:
         enough &= support_share(matching, support) >= lenience * config.min_support
-    return enough & (steadiness(matching, support) >= lenience * config.min_steadiness)
+    return enough & (steadiness_of_edges(matching, support) >= lenience * config.min_steadiness)
 
 
 def with_longer_ends(matching, shapes):

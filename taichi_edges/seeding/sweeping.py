@@ -30,7 +30,6 @@ STEP_PX = 1.5  # by which a place moves at most, in the neighbour with the longe
 BINS = 12  # of directions in the viewing plane of the reference, 15 degrees each
 ANGLES = 2 * BINS  # that are told apart: what agrees lies in one bin, or in two beside each other
 CODES = 254  # directions of edgels in a byte; 0 stands for no edgel
-NEAREST = 0.02  # unit cube: of a place to the reference's camera
 LEAST_SINE = 0.03  # of the angle between viewing planes; others have no line in common that could be compared
 CANDIDATES = 4  # depths kept for each reference
 TOGETHER = 3  # neighbours that must agree
@@ -248,7 +247,7 @@ def sweep_view(views, view, chosen, others, maps):
     """Candidate points and directions (k, 3), counts of views (k,) and pixel sizes (k,) of the chosen edgels of a view.
 
     chosen: (m,) bool, of its edgels. others: indices of its neighbours, at least TOGETHER. maps: `direction_maps`.
-    The step in inverse depth is that of STEP_PX along the epipolar line of the farthest neighbour: 1 / NEAREST of it
+    The step in inverse depth is that of STEP_PX along the epipolar line of the farthest neighbour: 1 / NEAR of it
     are far fewer than the 2^31 / ANGLES that a candidate can tell.
     """
     pixels, normals, _ = views.edgels.of_view(view)
@@ -263,7 +262,7 @@ def sweep_view(views, view, chosen, others, maps):
     near, far = through_box(centre, rays, views.box)
     # Nearer, fewer than TOGETHER neighbours look from directions that MOST_ANGLE allows.
     baselines = np.linalg.norm(centres[others] - centre, axis=1)
-    near = np.maximum(near, max(NEAREST, np.sort(baselines)[TOGETHER - 1] / np.tan(MOST_ANGLE)))
+    near = np.maximum(near, max(NEAR, np.sort(baselines)[TOGETHER - 1] / np.tan(MOST_ANGLE)))
     good = far > near
     if not good.any():
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int), np.zeros(0)

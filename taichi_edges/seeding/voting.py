@@ -23,11 +23,11 @@ from taichi_edges.kernels.points import (
     load_point,
     nearest_pixel,
 )
+from taichi_edges.views.cameras import NEAR
 from taichi_edges.views.views import pixel_size
 
 STEPS_PER_PIXEL, FARTHEST = 4, 255  # distances are kept in quarter pixels, one byte each
 HALF_DIAGONAL = np.sqrt(3) / 2  # of a unit cell
-NEAREST = 0.05  # unit-cube units: a camera nearer than this to a point does not vote on it
 FINEST_PX = 1.5  # cell size of the last level, pixels at the median depth
 LEVELS = 3  # each halves the cell; more where the first would have more than MOST_FIRST cells
 MOST_FIRST, MOST_CELLS = 2_000_000, 1 << 24  # cells of the first level; of any: a level with more is not entered
@@ -98,7 +98,7 @@ class DistanceBatches:
 def distance_at(distances: ti.template(), view, h):
     """The distance map's value where the projection h falls, -1 outside the image and too near to the camera."""
     found = -1
-    if h[2] > NEAREST:
+    if h[2] > NEAR:
         row, column = nearest_pixel(h)
         if row >= 0 and row < distances.shape[1] and column >= 0 and column < distances.shape[2]:
             found = ti.cast(distances[view, row, column], ti.i32)

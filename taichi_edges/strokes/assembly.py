@@ -9,7 +9,7 @@ from taichi_edges.geometry.shapes import Line
 from taichi_edges.strokes.arc_growth import Cloud
 from taichi_edges.strokes.branches import separate_branches
 from taichi_edges.strokes.claiming import claims
-from taichi_edges.strokes.cluster_fits import NOISE_FLOOR, Fit, fit_cluster, fit_line, wireframe_of
+from taichi_edges.strokes.cluster_fits import NOISE_FLOOR, ClusterFit, fit_cluster, fit_line, wireframe_of
 from taichi_edges.strokes.clustering import grow_clusters, seed_order
 from taichi_edges.strokes.free_curves import free_curves
 from taichi_edges.strokes.merging import merged
@@ -135,10 +135,10 @@ def fit_edge(points, arc, config):
     if arc is None:
         return fit_cluster(points, config)
     if arc.length < config.min_length:
-        return Fit("short")
+        return ClusterFit("short")
     if arc.curvature > 0:
         error = np.linalg.norm(arc.coordinates(points)[1], axis=1).mean()
         if max(error, NOISE_FLOOR) <= config.delta * fit_line(points, config.line_tolerance)[1]:
-            return Fit("loop" if arc.closed else "curve", arc.shape())
-        return Fit("line", Line(fit_line(points, config.line_tolerance)[0]))
-    return Fit("line", arc.shape())
+            return ClusterFit("loop" if arc.closed else "curve", arc.shape())
+        return ClusterFit("line", Line(fit_line(points, config.line_tolerance)[0]))
+    return ClusterFit("line", arc.shape())

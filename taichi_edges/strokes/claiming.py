@@ -13,7 +13,7 @@ import numpy as np
 
 from taichi_edges.fitting.arc_batch import ArcBatch
 from taichi_edges.fitting.arcs import Arc, fit_arc
-from taichi_edges.fitting.prices import price
+from taichi_edges.fitting.prices import price_of_arc
 from taichi_edges.strokes.arc_growth import INLIER, grown_from_seeds, unbroken
 
 OUTLIER = INLIER**2  # squared noises: what a point on an edge brings at most
@@ -74,7 +74,7 @@ def claims(cloud, neighbors, seeds, min_points):
 def claim_round(cloud, neighbors, seeds, min_points, ledger, found):
     """Add to the Claims in `found`, and to the Ledger, what can be claimed at the cloud's scale."""
     waiting, owner = [], ledger.owner
-    for number, (gain, *candidate) in enumerate(candidates(cloud, neighbors, seeds, min_points, owner)):
+    for number, (gain, *candidate) in enumerate(arc_candidates(cloud, neighbors, seeds, min_points, owner)):
         heapq.heappush(waiting, (-gain, number, *candidate))
     while waiting:
         _, number, *candidate = heapq.heappop(waiting)
@@ -119,7 +119,7 @@ def refined(cloud, claim, ledger):
     return Claim(arc, claim.own, claim.shared)
 
 
-def candidates(cloud, neighbors, seeds, min_points, owner):
+def arc_candidates(cloud, neighbors, seeds, min_points, owner):
     """Gains, Arcs and `Cloud.inliers` of these: grown from seeds until every point that nobody owns is on one.
 
     Or has grown none.
@@ -183,7 +183,7 @@ def supported(cloud, arc, inliers, owner, min_points):
         return 0.0, None
     if own.sum() * cloud.scale.gap < LEAST_DENSITY * np.ptp(along[own]):
         return 0.0, None
-    gain = (OUTLIER - squared[own]).sum() - price(arc) * np.log(len(members))
+    gain = (OUTLIER - squared[own]).sum() - price_of_arc(arc) * np.log(len(members))
     whole = arc if arc.closed and own.mean() >= OWN_SHARE else arc.over(along[kept].min(), along[kept].max())
     return gain, Claim(whole, members[own], members[kept & ~own])
 

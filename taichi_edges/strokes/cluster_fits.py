@@ -22,7 +22,7 @@ END_QUANTILE = 0.01  # of the points along a line: its ends, so that one stray p
 
 
 @dataclass(frozen=True)
-class Fit:
+class ClusterFit:
     """What became of one cluster: a shape of kind 'line', 'curve' or 'loop' (closed); 'short' or 'degenerate': None."""
 
     kind: str
@@ -43,17 +43,17 @@ def fit_cluster(points, config):
     them whatever they are.
     """
     if len(points) == 0 or not np.ptp(points, axis=0).any():
-        return Fit("degenerate")
+        return ClusterFit("degenerate")
     line, line_error = fit_line(points, config.line_tolerance)
     if len(points) >= 4:
         ordering = order_points(points)
         curves, curve_error = fit_curve(points, ordering, config.line_tolerance)
         long_enough = np.linalg.norm(np.diff(evaluate_bezier(curves, [0, 0.5, 1]), axis=1), axis=2).sum()
         if max(curve_error, NOISE_FLOOR) <= config.delta * line_error and long_enough >= config.min_length:
-            return Fit("loop" if ordering.closed else "curve", Spline(curves, ordering.closed))
+            return ClusterFit("loop" if ordering.closed else "curve", Spline(curves, ordering.closed))
     if np.linalg.norm(line[1] - line[0]) < config.min_length:
-        return Fit("short")
-    return Fit("line", Line(line))
+        return ClusterFit("short")
+    return ClusterFit("line", Line(line))
 
 
 def fit_line(points, tolerance):

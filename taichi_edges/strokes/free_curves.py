@@ -8,7 +8,7 @@ points a smooth chain of cubics describes better than the lines and arcs do, the
 import numpy as np
 
 from taichi_edges.fitting.cubic_chains import fewest_cubics, fit_chain, nearest_on_chain
-from taichi_edges.fitting.prices import CUBIC_PRICE, NEXT_CUBIC_PRICE, price
+from taichi_edges.fitting.prices import CUBIC_PRICE, NEXT_CUBIC_PRICE, price_of_arc
 from taichi_edges.strokes.arc_growth import INLIER
 from taichi_edges.strokes.branches import separate_branches
 from taichi_edges.strokes.claiming import OUTLIER
@@ -58,7 +58,9 @@ def cost_of_pieces(cloud, pieces, members):
 
 def price_of(piece):
     """Number of free parameters of a Piece."""
-    return price(piece.arc) if piece.arc is not None else CUBIC_PRICE + NEXT_CUBIC_PRICE * (len(piece.curves) - 1)
+    return (
+        price_of_arc(piece.arc) if piece.arc is not None else CUBIC_PRICE + NEXT_CUBIC_PRICE * (len(piece.curves) - 1)
+    )
 
 
 def cost_of_chain(cloud, members, worth):

@@ -13,7 +13,7 @@ import numpy as np
 
 from taichi_edges.fitting.arcs import Arc, fit_arc
 from taichi_edges.fitting.cubic_chains import Ordering, fit_chain, nearest_on_chain
-from taichi_edges.fitting.prices import CUBIC_PRICE, MOST_CUBICS, NEXT_CUBIC_PRICE, price
+from taichi_edges.fitting.prices import CUBIC_PRICE, MOST_CUBICS, NEXT_CUBIC_PRICE, price_of_arc
 from taichi_edges.strokes.arc_growth import INLIER, SAGITTA, sagitta
 from taichi_edges.strokes.claiming import OUTLIER
 
@@ -81,7 +81,7 @@ def merged(cloud, claims, noises):
     def propose(some):
         for number in some:
             ends.add(number, pieces[number])
-        for a, b in joints(cloud, pieces, ends, some):
+        for a, b in piece_joints(cloud, pieces, ends, some):
             gain, piece = joined(cloud, pieces[a[0]], pieces[b[0]], a[1], b[1])
             if gain > 0:
                 heapq.heappush(waiting, (-gain, a[0], b[0], next(turns), piece))
@@ -101,7 +101,7 @@ def piece_of(cloud, arc, own, shared):
     """The Piece of an arc and its points."""
     members = np.concatenate([own, shared])
     along, offsets = arc.coordinates(cloud.points[members])
-    cost = capped((offsets**2).sum(axis=1), cloud.noises[members]) + price(arc) * np.log(len(members))
+    cost = capped((offsets**2).sum(axis=1), cloud.noises[members]) + price_of_arc(arc) * np.log(len(members))
     return Piece(arc, None, own, shared, along, cost)
 
 
@@ -136,7 +136,7 @@ class EndGrid:
         return tuple(np.floor(place / self.reach).astype(int).tolist())
 
 
-def joints(cloud, pieces, grid, some):
+def piece_joints(cloud, pieces, grid, some):
     """Pairs of ends that are near and look at each other, each (number of the piece, 0 or 1); one of them in `some`.
 
     grid: EndGrid of all pieces, and of some that are gone.

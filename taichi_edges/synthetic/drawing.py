@@ -42,7 +42,7 @@ class Imperfections:
 def draw_edge_map(pixels, chains, strokes, visible, image_size, imperfections, generator):
     """One edge map.
 
-    pixels: (n, 2) samples, less than a pixel apart along a chain. chains, strokes: (n,) int, see `Samples`.
+    pixels: (n, 2) samples, less than a pixel apart along a chain. chains, strokes: (n,) int, see `LineSamples`.
     visible: (n,) bool. Returns (image_size, image_size) uint8.
     """
     shifts = generator.normal(0.0, imperfections.jitter_px, (strokes.max(initial=0) + 1, 2))

@@ -15,7 +15,7 @@ FLAT = 1e-9  # 1 - cosine: two triangles nearer than this lie in one plane, wher
 
 
 @dataclass(frozen=True)
-class Samples:
+class LineSamples:
     """Points along everything a camera may see as a line.
 
     points: (n, 3). outward: (n, 3) unit directions away from the solid. chains: (n,) int; consecutive points of one
@@ -29,7 +29,7 @@ class Samples:
 
     def joined(self, other):
         """These samples and the others, whose chains and strokes are renumbered."""
-        return Samples(
+        return LineSamples(
             np.concatenate([self.points, other.points]),
             np.concatenate([self.outward, other.outward]),
             np.concatenate([self.chains, other.chains + self.chains.max(initial=-1) + 1]),
@@ -71,7 +71,7 @@ def sample_edges(part, spacing):
         chains.append(np.full(count, len(edges.lines) + piece))
     points, chains = np.concatenate(points), np.concatenate(chains)
     sources = np.concatenate([edges.line_sources, edges.curve_sources])
-    return Samples(points, outward_directions(part, points, spacing), chains, sources[chains])
+    return LineSamples(points, outward_directions(part, points, spacing), chains, sources[chains])
 
 
 def outward_directions(part, points, spacing):
@@ -103,7 +103,7 @@ def sample_contours(part, centre, spacing):
     turning = candidates[facing[:, 0] != facing[:, 1]]
     ends = part.vertices[mesh.ends[turning]]
     points, chains = sample_segments(ends[:, 0], ends[:, 1], spacing)
-    return Samples(points, middle_direction(mesh.normals[turning])[chains], chains, np.zeros_like(chains))
+    return LineSamples(points, middle_direction(mesh.normals[turning])[chains], chains, np.zeros_like(chains))
 
 
 def visible_from(scene, samples, centre):

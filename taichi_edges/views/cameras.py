@@ -57,6 +57,73 @@ def project(points, intrinsics, world_to_camera):
     return homogeneous[:, :2] / safe[:, None], depths
 
 
+@dataclass(frozen=True)
+class Camera:
+    """One view. intrinsics: (3, 3) pixels. world_to_camera: (3, 4). width, height: pixels."""
+
+    intrinsics: np.ndarray
+    world_to_camera: np.ndarray
+    width: int
+    height: int
+
+    @property
+    def centre(self):
+        """(3,) where it stands."""
+        return -self.world_to_camera[:, :3].T @ self.world_to_camera[:, 3]
+
+    @property
+    def planes(self):
+        """(5, 4): the homogeneous images (u d, v d, d, 1) that are in sight have no negative product with any."""
+        right, below = self.width - 0.5, self.height - 0.5
+        return np.array([[0, 0, 1, -NEAR], [1, 0, 0.5, 0], [-1, 0, right, 0], [0, 1, 0.5, 0], [0, -1, below, 0]])
+
+    def homogeneous(self, points):
+        """(n, 4): u d, v d, d and 1 of (n, 3) points at depth d."""
+        seen = (points @ self.world_to_camera[:, :3].T + self.world_to_camera[:, 3]) @ self.intrinsics.T
+        return np.column_stack([seen, np.ones(len(points))])
+
+    def project_lines(self, points, directions):
+        """(n, 2) pixels of (n, 3) points, (n, 2) unit images of their directions, and whether they are in sight."""
+        seen, moved = self.homogeneous(points), directions @ (self.intrinsics @ self.world_to_camera[:, :3]).T
+        inside = (self.planes @ seen.T >= 0).all(axis=0)
+        depths = np.where(inside, seen[:, 2], 1.0)[:, None]
+        pixels = seen[:, :2] / depths
+        along = moved[:, :2] - pixels * moved[:, 2:]
+        return pixels, along / np.maximum(np.linalg.norm(along, axis=1), 1e-300)[:, None], inside
+
+    def slopes(self, points):
+        """(n, 2, 3): px that the projection of each (n, 3) point moves for a unit step along each axis of the world."""
+        homogeneous = self.homogeneous(points)
+        depths = homogeneous[:, 2, None, None]
+        rows = self.intrinsics @ self.world_to_camera[:, :3]
+        return (rows[None, :2] - homogeneous[:, :2, None] / depths * rows[2]) / depths
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Those of V views, for points that are each looked at in a view of their own.
+
+    matrices: (V, 3, 4) point -> homogeneous pixel. centres: (V, 3). focal: (V,) px.
+    """
+
+    matrices: np.ndarray
+    centres: np.ndarray
+    focal: np.ndarray
+
+    @staticmethod
+    def of(matrices):
+        """From (V, 3, 4) matrices intrinsics @ world_to_camera."""
+        centres = -np.linalg.solve(matrices[:, :, :3], matrices[:, :, 3:])[:, :, 0]
+        return Cameras(matrices, centres, np.sqrt(np.abs(np.linalg.det(matrices[:, :, :3]))))
+
+    def project(self, points, views):
+        """Pixels (n, 2), NaN behind the camera, and depths (n,) of points (n, 3), each in its own view (n,)."""
+        matrices = self.matrices[views]
+        homogeneous = np.einsum("nij,nj->ni", matrices[:, :, :3], points) + matrices[:, :, 3]
+        depths = homogeneous[:, 2]
+        return homogeneous[:, :2] / np.where(depths > NEAR, depths, np.nan)[:, None], depths
+
+
 def inside_image(pixels, width, height):
     """(n,) bool: which of the (n, 2) pixels round to a pixel of the image (NaN does not)."""
     u, v = pixels[:, 0], pixels[:, 1]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from taichi_edges.files.artefacts import file_state, replacing
-from taichi_edges.views.cameras import NEAR, Similarity, project
+from taichi_edges.views.cameras import NEAR, Camera, Similarity, project
 from taichi_edges.views.edgels import Edgels
 
 EDGEL_ARRAYS = ("starts", "points", "normals", "strengths")  # the fields of Edgels, in order
@@ -61,6 +61,10 @@ class Views:
     def width(self):
         """Pixels."""
         return self.edge_maps.shape[2]
+
+    def camera(self, view):
+        """The Camera of one view."""
+        return Camera(self.intrinsics[view], self.world_to_camera[view], self.width, self.height)
 
     def project(self, points, view):
         """Pixels (n, 2), NaN behind the camera, and depths (n,) of (n, 3) unit-cube points in one view."""

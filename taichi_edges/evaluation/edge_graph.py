@@ -15,7 +15,7 @@ from taichi_edges.evaluation.primitives import CORNER_DEGREES, JOINED
 
 
 @dataclass(frozen=True)
-class Wireframe:
+class EdgeGraph:
     """Edges as a graph sees them.
 
     polylines: list of (m, 3) pieces. edges: (P,) int, the edge of each piece, numbered from 0.
@@ -56,12 +56,12 @@ class Ends:
     edges: np.ndarray
 
 
-def wireframe(polylines, sources):
-    """Pieces (m, 3) and the (P,) source of each -> Wireframe; pieces of no length are left out."""
+def edge_graph(polylines, sources):
+    """Pieces (m, 3) and the (P,) source of each -> EdgeGraph; pieces of no length are left out."""
     sizes = np.array([np.ptp(polyline, axis=0).max() for polyline in polylines])
     kept = np.flatnonzero(sizes > 0)
     _, edges = np.unique(np.asarray(sources, dtype=np.int64)[kept], return_inverse=True)
-    return Wireframe([polylines[index] for index in kept], edges)
+    return EdgeGraph([polylines[index] for index in kept], edges)
 
 
 def edge_ends(polylines, edges):
@@ -98,7 +98,7 @@ def close_pairs(points):
 
 
 def contacts_of(frame):
-    """The `contacts` of a Wireframe. An end is always near its own piece: only the piece's other end counts there."""
+    """The `contacts` of an EdgeGraph. An end is always near its own piece: only the piece's other end counts there."""
     ends = frame.ends
     at, pieces, _, _ = frame.dense.within(ends.points, JOINED)
     foreign = pieces != ends.pieces[at]
