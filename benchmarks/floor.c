@@ -16,7 +16,7 @@
 #define ALPHA_MIN (1.0f / 255.0f)
 #define ALPHA_MAX 0.999f
 #define BOX_SIGMAS 3.0f
-#define NEAR_PLANE 0.01f
+#define NEAR_PLANE 0.05f
 #define LOG2_E 1.44269504f
 #define MIN(a, b) ((a) < (b) ? (a) : (b))
 #define MAX(a, b) ((a) > (b) ? (a) : (b))

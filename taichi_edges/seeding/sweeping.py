@@ -18,7 +18,7 @@ from taichi_edges.kernels.device import download, upload
 from taichi_edges.kernels.points import F32_1D, F32_2D, I32_1D, I32_2D, U8_3D
 from taichi_edges.seeding.starts import ACROSS_PX, ALONG_PX, LEAST_VOTED
 from taichi_edges.splatting.gaussians import orient_gaussians
-from taichi_edges.views.cameras import NEAR, inside_image, project
+from taichi_edges.views.cameras import NEAR, SWEPT_FROM, inside_image, project
 from taichi_edges.views.views import pixel_size
 
 EVERY_PX = 8  # one edgel in each cell of this size is a reference
@@ -262,7 +262,7 @@ def sweep_view(views, view, chosen, others, maps):
     near, far = through_box(centre, rays, views.box)
     # Nearer, fewer than TOGETHER neighbours look from directions that MOST_ANGLE allows.
     baselines = np.linalg.norm(centres[others] - centre, axis=1)
-    near = np.maximum(near, max(NEAR, np.sort(baselines)[TOGETHER - 1] / np.tan(MOST_ANGLE)))
+    near = np.maximum(near, max(SWEPT_FROM, np.sort(baselines)[TOGETHER - 1] / np.tan(MOST_ANGLE)))
     good = far > near
     if not good.any():
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int), np.zeros(0)

@@ -23,7 +23,7 @@ from taichi_edges.kernels.points import (
     load_point,
     nearest_pixel,
 )
-from taichi_edges.views.cameras import NEAR
+from taichi_edges.views.cameras import DRAWN_FROM
 from taichi_edges.views.views import pixel_size
 
 STEPS_PER_PIXEL, FARTHEST = 4, 255  # distances are kept in quarter pixels, one byte each
@@ -98,7 +98,7 @@ class DistanceBatches:
 def distance_at(distances: ti.template(), view, h):
     """The distance map's value where the projection h falls, -1 outside the image and too near to the camera."""
     found = -1
-    if h[2] > NEAR:
+    if h[2] > DRAWN_FROM:
         row, column = nearest_pixel(h)
         if row >= 0 and row < distances.shape[1] and column >= 0 and column < distances.shape[2]:
             found = ti.cast(distances[view, row, column], ti.i32)

@@ -3,7 +3,7 @@
 import numpy as np
 import taichi as ti
 
-from taichi_edges.views.cameras import NEAR
+from taichi_edges.views.cameras import DRAWN_FROM
 
 SCREEN_BLUR = 0.3  # px^2 added to the 2D covariance; its loss of peak is compensated in the opacity
 ALPHA_MIN = 1.0 / 255.0  # a smaller contribution is not drawn
@@ -84,7 +84,7 @@ def make_splat_of(gaussians, cameras, exp2):
         pose, pinhole = poses[view], pinholes[view]
         camera_rotation = pose[:, :3]
         point = camera_rotation @ means[i] + pose[:, 3]
-        inverse_depth = 1.0 / ti.max(point[2], NEAR)
+        inverse_depth = 1.0 / ti.max(point[2], DRAWN_FROM)
         x, y = point[0] * inverse_depth, point[1] * inverse_depth
         # M = J R_camera R S (2 x 3), the 2D covariance is M M^T. J: Jacobian of the pinhole at the mean.
         right, down, forward = camera_rotation[0, :], camera_rotation[1, :], camera_rotation[2, :]
@@ -116,7 +116,7 @@ def box_of(splat, variances, depth, width, height):
     u1 = ti.min(width, ti.cast(ti.floor(splat[0] + reach_u), ti.i32) + 1)
     v0 = ti.max(0, ti.cast(ti.ceil(splat[1] - reach_v), ti.i32))
     v1 = ti.min(height, ti.cast(ti.floor(splat[1] + reach_v), ti.i32) + 1)
-    if depth < NEAR or splat[5] < ALPHA_MIN or u1 <= u0 or v1 <= v0:
+    if depth < DRAWN_FROM or splat[5] < ALPHA_MIN or u1 <= u0 or v1 <= v0:
         u1, v1 = u0, v0
     return ti.Vector([u0, u1, v0, v1])
 

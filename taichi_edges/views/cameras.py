@@ -12,7 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-NEAR = 0.01  # unit-cube units: nearer than this counts as behind the camera
+# Near planes, all there are, in unit-cube units.
+NEAR = 0.01  # what is nearer counts as behind the camera
+SWEPT_FROM = 2 * NEAR  # a sweep's steps are even in inverse depth: half of them would lie nearer than this
+DRAWN_FROM = 5 * NEAR  # a nearer Gaussian would fill the image: it is not drawn, and its camera does not vote
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # right-multiplies camera-to-world: flips the y and z camera axes
 
