@@ -1,6 +1,7 @@
 """The one exception for everything a user can cause and put right."""
 
 import difflib
+from collections.abc import Iterable
 
 
 class UserError(Exception):
@@ -10,23 +11,23 @@ class UserError(Exception):
     library's message) may hold line breaks; they become spaces.
     """
 
-    def __init__(self, text):
+    def __init__(self, text: str) -> None:
         super().__init__(" ".join(str(text).split()))
 
 
-def did_you_mean(name, known):
+def did_you_mean(name: object, known: Iterable[object]) -> str:
     """'; did you mean 'position'?' for the known name nearest to `name`, or '' where none is near."""
     near = difflib.get_close_matches(str(name), [str(k) for k in known], n=1, cutoff=0.5)
     return f"; did you mean '{near[0]}'?" if near else ""
 
 
-def name_some(names, most=5):
+def name_some(names: Iterable[object], most: int = 5) -> str:
     """'a, b, c and 4 more': a list short enough for one line."""
-    names = [str(name) for name in names]
-    rest = len(names) - most
-    return ", ".join(names) if rest <= 0 else f"{', '.join(names[:most])} and {rest} more"
+    words = [str(name) for name in names]
+    rest = len(words) - most
+    return ", ".join(words) if rest <= 0 else f"{', '.join(words[:most])} and {rest} more"
 
 
-def amount(count, noun, plural=None):
+def amount(count: int, noun: str, plural: str | None = None) -> str:
     """'1 line', '2 lines', '3 more boxes'."""
     return f"{count} {noun if count == 1 else plural or noun + 's'}"

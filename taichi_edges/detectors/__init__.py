@@ -3,24 +3,37 @@
 DETECTORS[name](frames, run) gives the frames it could use, edge maps (V, H, W) uint8, and Edgels or None.
 """
 
+from typing import TYPE_CHECKING
+
 from taichi_edges.errors import UserError
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
 
-def choose_detector(source, frames):
+    import numpy as np
+
+    from taichi_edges.corridor.pipeline import Run
+    from taichi_edges.readers.frames import Frames
+    from taichi_edges.scene.settings import SourceConfig
+    from taichi_edges.views.edgels import Edgels
+
+
+def choose_detector(source: "SourceConfig", frames: "Frames") -> str:
     """The detector that `source.detector: auto` means: ready maps where the scene names them, else our own."""
     if source.detector != "auto":
         return source.detector
     return "maps" if source.edges or not any(frames.image_paths) else "subpixel"
 
 
-def read_maps(frames, run):
+def read_maps(frames: "Frames", run: "Run") -> "tuple[Frames, np.ndarray, Edgels | None]":
     """Ready edge maps. They may be biased, and have no edgels yet."""
     from taichi_edges.readers.images import read_edge_maps
 
     return frames, read_edge_maps(frames, run.progress, run.threads), None
 
 
-def detect_subpixel(frames, run):
+def detect_subpixel(frames: "Frames", run: "Run") -> "tuple[Frames, np.ndarray, Edgels | None]":
     """Edgels by our own detector, and maps drawn through them."""
     import numpy as np
 
@@ -30,7 +43,8 @@ def detect_subpixel(frames, run):
 
     frames = frames_with_images(frames, run.progress)
     with run.progress.track("detect", len(frames.names)) as report:
-        edgels, sizes = trace_pictures(frames.image_paths, run.threads, report, run.config.source.gamma or None)
+        edgels, found = trace_pictures(frames.image_paths, run.threads, report, run.config.source.gamma or None)
+    sizes = [size for size in found if size is not None]  # all of them: every frame has an image
     check_sizes(frames, sizes, "colour image")
     if len(edgels) == 0:
         problem = f"no edge found in any of {len(frames.names)} images"
@@ -40,7 +54,7 @@ def detect_subpixel(frames, run):
     return frames, draw_edge_maps(edgels, height, width, run.threads), edgels
 
 
-def detect_onnx(frames, run):
+def detect_onnx(frames: "Frames", run: "Run") -> "tuple[Frames, np.ndarray, Edgels | None]":
     """Edge maps by a learned detector, biased as such detectors are."""
     import numpy as np
 
@@ -56,21 +70,22 @@ def detect_onnx(frames, run):
 
 
 class ComposedImages:
-    """The images of some paths, each decoded when it is asked for: (H, W, 3) uint8 RGB, transparent ones over white."""
+    """The images of some paths, each decoded when its turn comes: (H, W, 3) uint8 RGB, transparent ones over white."""
 
-    def __init__(self, paths):
+    def __init__(self, paths: "Sequence[Path | str]") -> None:
         self.paths = paths
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.paths)
 
-    def __getitem__(self, index):
+    def __iter__(self) -> "Iterator[np.ndarray]":
         from taichi_edges.views.pictures import read_colour
 
-        colour = read_colour(self.paths[index])
-        if colour is None:
-            raise UserError(f"{self.paths[index]}: not an image that can be read; export it again, or skip this view")
-        return colour[:, :, ::-1]
+        for path in self.paths:
+            colour = read_colour(path)
+            if colour is None:
+                raise UserError(f"{path}: not an image that can be read; export it again, or skip this view")
+            yield colour[:, :, ::-1]
 
 
 DETECTORS = {"maps": read_maps, "subpixel": detect_subpixel, "onnx": detect_onnx}

@@ -7,15 +7,18 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from taichi_edges.views.edgels import Edgels
+
 LINK_PX = 1.6  # between edgels next to each other on a chain; they are about 1 px apart
 LINK_COSINE = np.cos(np.radians(25.0))  # between their normals
 SURE_PX = 8.0  # px of a chain that say as much as one edgel alone: those beside each other share their noise
 BESIDE_PX = 0.7  # by which the next edgel may be off the line of the one before
 
 
-def chain_labels(edgels):
+def chain_labels(edgels: Edgels) -> np.ndarray:
     """(e,) int: the chain of each of the Edgels; chains are numbered over all views."""
-    counts, labels = 0, []
+    counts = 0
+    labels: list[np.ndarray] = []
     for view in range(edgels.view_count):
         points, normals, _ = edgels.of_view(view)
         found, some = _chains_of(points, normals)
@@ -24,7 +27,7 @@ def chain_labels(edgels):
     return np.concatenate([np.zeros(0, np.int64), *labels])
 
 
-def _chains_of(points, normals):
+def _chains_of(points: np.ndarray, normals: np.ndarray) -> tuple[int, np.ndarray]:
     """Number of chains in one view, and (n,) the chain of each edgel. points: (n, 2) px. normals: (n, 2)."""
     if not len(points):
         return 0, np.zeros(0, np.int64)
@@ -34,7 +37,9 @@ def _chains_of(points, normals):
     return labels.max() + 1, labels
 
 
-def links_between(points, normals, reach):
+def links_between(
+    points: np.ndarray, normals: np.ndarray, reach: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Pairs of edgels of one view that may follow each other: first and second (k,), absolute cosines (k,) between
     their normals, and (2, k) px by which each is off the line through the other one.
 
@@ -46,19 +51,19 @@ def links_between(points, normals, reach):
     return first, second, cosines, np.abs([(way * normals[end]).sum(axis=1) for end in (first, second)])
 
 
-def components(count, first, second):
+def components(count: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """(count,) labels, 0 .. n - 1, of the connected components of a graph with edges from `first` to `second`."""
     graph = coo_matrix((np.ones(len(first), bool), (first, second)), shape=(count, count))
     return connected_components(graph, directed=False)[1]
 
 
-def chain_lengths(edgels):
+def chain_lengths(edgels: Edgels) -> np.ndarray:
     """(e,) number of edgels on the chain of each edgel: its length in pixels, roughly."""
     labels = chain_labels(edgels)
     return np.bincount(labels)[labels] if len(labels) else np.zeros(0, np.int64)
 
 
-def with_chain_strengths(edgels, height, width):
+def with_chain_strengths(edgels: Edgels, height: int, width: int) -> tuple[Edgels, np.ndarray]:
     """The Edgels with their chain's say in how sure they are and how they run, and (e,) the length of its chain each.
 
     An edgel is as sure as its whole chain, if each SURE_PX of that could be wrong by themselves, and its normal is the

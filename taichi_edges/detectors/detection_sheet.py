@@ -4,6 +4,7 @@ It is looked at before anything is trained: a map that is shifted, an object tha
 half of the edges go is seen here at a glance. All colours and pictures in this module are RGB.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from taichi_edges.files.artefacts import replacing
 from taichi_edges.views.pictures import SAME_SHAPE, read_colour
-from taichi_edges.views.views import choose_views
+from taichi_edges.views.views import Views, choose_views
 
 CELL_WIDTH = 400  # px of the sheet; six columns fit a wide screen
 CELL_HEIGHTS = (240, 480)  # px; the shape of the views between these
@@ -58,11 +59,21 @@ class Content:
     strengths: np.ndarray
     residuals: np.ndarray | None
     silhouette: np.ndarray | None
-    window: tuple
+    window: tuple[int, int, int, int]
     limit: float
 
 
-def write_detection_sheet(path, views, residuals=None, on_silhouette=None, picture_reader=None, count=4):
+Column = Callable[[Content, tuple[int, int]], np.ndarray]  # (content, cell) -> (h, w, 3) uint8: draws one of its cells
+
+
+def write_detection_sheet(
+    path: Path | str,
+    views: Views,
+    residuals: np.ndarray | None = None,
+    on_silhouette: np.ndarray | None = None,
+    picture_reader: Callable[[str], np.ndarray | None] | None = None,
+    count: int = 4,
+) -> Path:
     """Write the sheet: a row for each of `count` views that look in different directions. Returns the path.
 
     views: Views with edgels. residuals: (n,) px per edgel, signed, NaN where unknown. on_silhouette: (n,) bool, or
@@ -87,7 +98,7 @@ def write_detection_sheet(path, views, residuals=None, on_silhouette=None, pictu
     return Path(path)
 
 
-def residual_colours(residuals, limit):
+def residual_colours(residuals: np.ndarray, limit: float) -> np.ndarray:
     """(n,) px -> (n, 3) uint8 RGB: from NEGATIVE at -limit through ZERO to POSITIVE at limit; UNKNOWN for NaN."""
     share = np.clip(np.asarray(residuals, dtype=np.float64) / limit, -1.0, 1.0)[:, None]
     ends = np.where(share < 0, NEGATIVE, POSITIVE)
@@ -95,13 +106,13 @@ def residual_colours(residuals, limit):
     return np.where(np.isnan(share), UNKNOWN, np.rint(colours)).astype(np.uint8)
 
 
-def strength_colours(strengths):
+def strength_colours(strengths: np.ndarray) -> np.ndarray:
     """(n,) 0..1 -> (n, 3) uint8 RGB of viridis, without its darkest."""
     viridis = cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_VIRIDIS).reshape(256, 3)[:, ::-1]
     return viridis[np.rint(WEAKEST + (255 - WEAKEST) * np.clip(strengths, 0.0, 1.0)).astype(int)]
 
 
-def median_and_mad(residuals):
+def median_and_mad(residuals: np.ndarray) -> tuple[float, float, int]:
     """Median and median absolute deviation, px, and number of the known ones; NaN where there is none."""
     known = residuals[np.isfinite(residuals)]
     if not len(known):
@@ -113,35 +124,43 @@ def median_and_mad(residuals):
 # --- What is drawn ---
 
 
-def _read_picture(path):
+def _read_picture(path: str) -> np.ndarray | None:
     picture = read_colour(path)
     return None if picture is None else picture[:, :, ::-1]
 
 
-def _limit(residuals):
+def _limit(residuals: np.ndarray | None) -> float:
     """px; the end of the colour bar: a round number that holds most of the residuals."""
     known = np.abs(residuals[np.isfinite(residuals)]) if residuals is not None else np.zeros(0)
     wanted = np.percentile(known, COVERED) if len(known) else LIMITS[0]
     return next((limit for limit in LIMITS if limit >= wanted), LIMITS[-1])
 
 
-def _cell_size(views):
+def _cell_size(views: Views) -> tuple[int, int]:
     """(width, height) px of a cell: the shape of the views, unless that is extreme."""
     return CELL_WIDTH, int(np.clip(round(CELL_WIDTH * views.height / views.width), *CELL_HEIGHTS))
 
 
-def _content(views, view, residuals, silhouette, limit, cell, picture_reader):
+def _content(
+    views: Views,
+    view: int,
+    residuals: np.ndarray | None,
+    silhouette: np.ndarray | None,
+    limit: float,
+    cell: tuple[int, int],
+    picture_reader: Callable[[str], np.ndarray | None],
+) -> Content:
+    assert views.edgels is not None
     part = slice(views.edgels.starts[view], views.edgels.starts[view + 1])
     points, normals, strengths = views.edgels.of_view(view)
-    of_view = [None if values is None else values[part] for values in (residuals, silhouette)]
-    window = _busiest(points, *of_view, (views.width, views.height), cell)
-    photo = _photo(views, view, picture_reader)
-    picture = cv2.cvtColor(255 - views.edge_maps[view], cv2.COLOR_GRAY2RGB) if photo is None else photo
-    shown = picture, photo is not None, views.edge_maps[view]
-    return Content(*shown, points, normals, strengths, *of_view, window, limit)
+    off, outer = (None if values is None else values[part] for values in (residuals, silhouette))
+    window = _busiest(points, off, outer, (views.width, views.height), cell)
+    photo, edge_map = _photo(views, view, picture_reader), views.edge_maps[view]
+    picture = cv2.cvtColor(255 - edge_map, cv2.COLOR_GRAY2RGB) if photo is None else photo
+    return Content(picture, photo is not None, edge_map, points, normals, strengths, off, outer, window, limit)
 
 
-def _photo(views, view, picture_reader):
+def _photo(views: Views, view: int, picture_reader: Callable[[str], np.ndarray | None]) -> np.ndarray | None:
     """(H, W, 3) uint8 in the size of the view; None where there is no picture of it."""
     picture = picture_reader(views.image_paths[view]) if views.image_paths[view] else None
     if picture is None:
@@ -152,7 +171,13 @@ def _photo(views, view, picture_reader):
     return cv2.resize(picture, (views.width, views.height), interpolation=cv2.INTER_AREA)
 
 
-def _busiest(points, residuals, silhouette, size, cell):
+def _busiest(
+    points: np.ndarray,
+    residuals: np.ndarray | None,
+    silhouette: np.ndarray | None,
+    size: tuple[int, int],
+    cell: tuple[int, int],
+) -> tuple[int, int, int, int]:
     """Left, top, width, height, px, of the part to magnify: where most edgels are, of both kinds where they are known.
 
     Edgels without a residual do not count where others have one. Without any, the middle of the view.
@@ -170,7 +195,7 @@ def _busiest(points, residuals, silhouette, size, cell):
     return int(left), int(top), width, height
 
 
-def _window_sums(points, size, window):
+def _window_sums(points: np.ndarray, size: tuple[int, int], window: tuple[int, int]) -> np.ndarray:
     """How many points lie in each place of a window in an image; both sizes are (width, height) px."""
     columns, rows = (
         np.clip(np.rint(values), 0, side - 1).astype(int) for values, side in zip(points.T, size, strict=True)
@@ -184,25 +209,25 @@ def _window_sums(points, size, window):
 # --- The cells of a row ---
 
 
-def _columns(residuals):
+def _columns(residuals: np.ndarray | None) -> list[Column]:
     """The cells of a row, from left to right: functions (content, cell) -> (h, w, 3) uint8."""
     return [_whole_picture, _whole_map, _whole_edgels, _magnified_edgels] + (
         [_magnified_residuals, _histograms] if residuals is not None else []
     )
 
 
-def _whole_picture(content, cell):
+def _whole_picture(content: Content, cell: tuple[int, int]) -> np.ndarray:
     return _centred(_fitted(content.picture, cell), cell)
 
 
-def _whole_map(content, cell):
+def _whole_map(content: Content, cell: tuple[int, int]) -> np.ndarray:
     fitted = _fitted(content.edge_map, cell).astype(np.float32)
     gain = EDGE_GAIN if fitted.shape[0] < content.edge_map.shape[0] else 1.0
     drawn = (255 - np.clip(gain * fitted, 0, 255)).astype(np.uint8)
     return _centred(cv2.cvtColor(drawn, cv2.COLOR_GRAY2RGB), cell)
 
 
-def _whole_edgels(content, cell):
+def _whole_edgels(content: Content, cell: tuple[int, int]) -> np.ndarray:
     picture = _dim(_fitted(content.picture, cell))
     scale = picture.shape[1] / content.picture.shape[1]
     order = np.argsort(content.strengths, kind="stable")  # the sure ones on top
@@ -213,15 +238,16 @@ def _whole_edgels(content, cell):
     return _centred(picture, cell)
 
 
-def _magnified_edgels(content, cell):
+def _magnified_edgels(content: Content, cell: tuple[int, int]) -> np.ndarray:
     return _magnified(content, cell, strength_colours(content.strengths))
 
 
-def _magnified_residuals(content, cell):
+def _magnified_residuals(content: Content, cell: tuple[int, int]) -> np.ndarray:
+    assert content.residuals is not None  # else there is no such column
     return _magnified(content, cell, residual_colours(content.residuals, content.limit))
 
 
-def _magnified(content, cell, colours):
+def _magnified(content: Content, cell: tuple[int, int], colours: np.ndarray) -> np.ndarray:
     """The window of the view, every pixel a square, with its edgels: a dot at its place, a dash along its edge."""
     left, top, wide, high = content.window
     part = _dim(_stretched(content.picture[top : top + high, left : left + wide]))
@@ -239,7 +265,7 @@ def _magnified(content, cell, colours):
     return _centred(picture, cell)
 
 
-def _scale_bar(picture, scale):
+def _scale_bar(picture: np.ndarray, scale: float) -> None:
     """A white bar SCALE_BAR pixels of the view long, with its length, at the lower left."""
     length, bottom = round(SCALE_BAR * scale), picture.shape[0] - 10
     words = f"{SCALE_BAR} px"
@@ -251,8 +277,9 @@ def _scale_bar(picture, scale):
     _write(picture, words, (length + 17, bottom), PAPER)
 
 
-def _histograms(content, cell):
+def _histograms(content: Content, cell: tuple[int, int]) -> np.ndarray:
     """The residuals of silhouettes and of creases, one above the other, on one axis."""
+    assert content.residuals is not None  # else there is no such column
     picture = np.full((cell[1], cell[0], 3), 255, np.uint8)
     if content.silhouette is None:
         kinds = [("all edgels", np.ones(len(content.points), bool))]
@@ -266,7 +293,7 @@ def _histograms(content, cell):
     return picture
 
 
-def _histogram(picture, name, residuals, limit):
+def _histogram(picture: np.ndarray, name: str, residuals: np.ndarray, limit: float) -> None:
     """Bars, the zero line, the median and its number, in place. What lies beyond the limit is in the last bars."""
     height, width = picture.shape[:2]
     median, mad, known = median_and_mad(residuals)
@@ -288,16 +315,16 @@ def _histogram(picture, name, residuals, limit):
         cv2.line(picture, (place, base), (place, LINE + 6), FRAME, 2)
 
 
-def _described(median, mad, known):
+def _described(median: float, mad: float, known: int) -> str:
     return f"median {median:+.2f}, MAD {mad:.2f} px, n = {known}" if known else "none"
 
 
-def _across(residual, limit, width):
+def _across(residual: float, limit: float, width: int) -> int:
     """Column of a residual in a histogram `width` px wide; half a bin is left free at each end."""
     return round(width * (0.5 + 0.48 * residual / limit))
 
 
-def _axis(picture, limit):
+def _axis(picture: np.ndarray, limit: float) -> None:
     """Numbers below the histograms, px."""
     height, width = picture.shape[:2]
     for share in (-1.0, -0.5, 0.0, 0.5, 1.0):
@@ -308,22 +335,30 @@ def _axis(picture, limit):
 
 # --- The text around the cells ---
 
-HEADINGS = {
+HEADINGS: dict[Column, tuple[str, str]] = {
     _whole_picture: ("view", ""),
     _whole_map: ("edge map", "what the splatting learns from"),
     _whole_edgels: ("edgels", "framed: the part that is magnified"),
-    _magnified_edgels: ("edgels, magnified", None),
-    _magnified_residuals: ("residuals, magnified", None),
+    _magnified_edgels: ("edgels, magnified", ""),
+    _magnified_residuals: ("residuals, magnified", ""),
     _histograms: ("residuals", "outwards positive; red: median"),
 }
 
 
-def _header(views, shown, residuals, silhouette, limit, cell):
+def _header(
+    views: Views,
+    shown: int,
+    residuals: np.ndarray | None,
+    silhouette: np.ndarray | None,
+    limit: float,
+    cell: tuple[int, int],
+) -> np.ndarray:
     """Title, the numbers over all views, and the headings and colour bars of the columns."""
     columns = _columns(residuals)
     width = GAP + len(columns) * (cell[0] + GAP)
     picture = np.full((5 * LINE + GAP, width, 3), 255, np.uint8)
     known = int(np.isfinite(residuals).sum()) if residuals is not None else 0
+    assert views.edgels is not None
     title = f"{len(views)} views of {views.width} x {views.height} px ({shown} shown), {len(views.edgels)} edgels"
     _write(picture, f"{title}, {known} with a residual" if residuals is not None else title, (GAP, LINE), bold=True)
     if residuals is not None:
@@ -341,14 +376,22 @@ def _header(views, shown, residuals, silhouette, limit, cell):
     return picture
 
 
-def _summary(residuals, silhouette):
+def _summary(residuals: np.ndarray, silhouette: np.ndarray | None) -> str:
     if silhouette is None:
         return _described(*median_and_mad(residuals))
     parts = (("silhouettes", silhouette), ("creases", ~silhouette))
     return "; ".join(f"{name} {_described(*median_and_mad(residuals[chosen]))}" for name, chosen in parts)
 
 
-def _bar(picture, corner, colours, ticks, form, unit, cell):
+def _bar(
+    picture: np.ndarray,
+    corner: tuple[int, int],
+    colours: Callable[[np.ndarray], np.ndarray],
+    ticks: Sequence[float],
+    form: str,
+    unit: str,
+    cell: tuple[int, int],
+) -> None:
     """A colour bar from the first tick to the last with the numbers and the unit."""
     left, top = corner
     first, last = (form.format(tick) if tick else "0" for tick in (ticks[0], ticks[-1]))
@@ -360,7 +403,7 @@ def _bar(picture, corner, colours, ticks, form, unit, cell):
     _write(picture, f"{last} {unit}", (start + length + 6, top + LINE - 6))
 
 
-def _row_title(views, view, content, cell):
+def _row_title(views: Views, view: int, content: Content, cell: tuple[int, int]) -> np.ndarray:
     """The strip above a row: which view it is, its numbers and how much is magnified."""
     columns = _columns(content.residuals)
     picture = np.full((LINE + 8, GAP + len(columns) * (cell[0] + GAP), 3), 255, np.uint8)
@@ -372,7 +415,7 @@ def _row_title(views, view, content, cell):
         count += f", median strength {np.median(content.strengths):.2f}"
     what = "" if content.is_photo else " (no picture: edge map)"
     name = _shortened(views.names[view], cell[0] - _text_width(what, bold=True)) + what
-    words = {_whole_picture: name, _whole_edgels: count, _magnified_edgels: magnified}
+    words: dict[Column, str] = {_whole_picture: name, _whole_edgels: count, _magnified_edgels: magnified}
     if content.residuals is not None:
         words[_magnified_residuals] = f"{np.isfinite(content.residuals).sum()} with a residual"
     for place, column in enumerate(columns):
@@ -381,7 +424,7 @@ def _row_title(views, view, content, cell):
     return picture
 
 
-def _shortened(words, width):
+def _shortened(words: str, width: int) -> str:
     """Words that fit `width` px."""
     for length in range(len(words), 0, -1):
         shorter = words if length == len(words) else words[:length] + "..."
@@ -390,7 +433,7 @@ def _shortened(words, width):
     return ""
 
 
-def _row(cells):
+def _row(cells: Sequence[np.ndarray]) -> np.ndarray:
     """Cells side by side, with gaps."""
     height = cells[0].shape[0]
     gap = np.full((height, GAP, 3), 255, np.uint8)
@@ -398,24 +441,31 @@ def _row(cells):
     return np.concatenate([row, np.full((GAP, row.shape[1], 3), 255, np.uint8)])
 
 
-def _ascii(words):
+def _ascii(words: str) -> str:
     """OpenCV's letters are ASCII."""
     return words.encode("ascii", "replace").decode()
 
 
-def _text_width(words, bold=False):
+def _text_width(words: str, bold: bool = False) -> int:
     """px; OpenCV 5 writes narrower letters than OpenCV 4."""
     return cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, LETTERS, 2 if bold else 1)[0][0]
 
 
-def _write(picture, words, origin, colour=INK, bold=False, room=None):
+def _write(
+    picture: np.ndarray,
+    words: str,
+    origin: tuple[float, float],
+    colour: tuple[int, int, int] = INK,
+    bold: bool = False,
+    room: int | None = None,
+) -> None:
     """Letters with their lower left corner at `origin`, (x, y) px; smaller ones where they need more than `room` px."""
     words, place = _ascii(words), tuple(round(value) for value in origin)
     scale = LETTERS * min(1.0, (room or np.inf) / max(_text_width(words, bold), 1))
     cv2.putText(picture, words, place, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 2 if bold else 1, cv2.LINE_AA)
 
 
-def _write_centred(picture, words, column, baseline):
+def _write_centred(picture: np.ndarray, words: str, column: int, baseline: int) -> None:
     """Letters around a column, pushed inside the picture."""
     wide = _text_width(words)
     _write(picture, words, (np.clip(column - wide / 2, 0, picture.shape[1] - wide - 1), baseline))
@@ -424,7 +474,7 @@ def _write_centred(picture, words, column, baseline):
 # --- Pixels ---
 
 
-def _fitted(picture, cell):
+def _fitted(picture: np.ndarray, cell: tuple[int, int]) -> np.ndarray:
     """A picture as large as fits the cell; pixels stay squares where it grows."""
     height, width = picture.shape[:2]
     scale = min(cell[0] / width, cell[1] / height)
@@ -432,7 +482,7 @@ def _fitted(picture, cell):
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST)
 
 
-def _centred(picture, cell):
+def _centred(picture: np.ndarray, cell: tuple[int, int]) -> np.ndarray:
     """The picture in the middle of a cell."""
     whole = np.full((cell[1], cell[0], 3), FAINT, np.uint8)
     top, left = (cell[1] - picture.shape[0]) // 2, (cell[0] - picture.shape[1]) // 2
@@ -441,17 +491,17 @@ def _centred(picture, cell):
     return whole
 
 
-def _stretched(picture):
+def _stretched(picture: np.ndarray) -> np.ndarray:
     """A picture with all its contrast, the same factor for the three channels: dark corners are looked into as well."""
     dark, bright = np.percentile(picture, (1, 99))
     return np.clip((picture - dark) * (255 / max(bright - dark, LEAST_CONTRAST)), 0, 255)
 
 
-def _dim(picture):
+def _dim(picture: np.ndarray) -> np.ndarray:
     return np.rint(DIMMED * picture).astype(np.uint8)
 
 
-def _stamp(picture, places, colours, radius):
+def _stamp(picture: np.ndarray, places: np.ndarray, colours: np.ndarray, radius: float) -> None:
     """Put round dots on a picture, in place; later ones on top. places: (n, 2) px. colours: (n, 3). radius: px."""
     height, width = picture.shape[:2]
     fine = np.zeros((height * OVERSAMPLING, width * OVERSAMPLING, 4), np.uint8)  # RGB and whether there is a dot

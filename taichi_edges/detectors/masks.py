@@ -10,18 +10,21 @@ import cv2
 import numpy as np
 
 from taichi_edges.errors import UserError, name_some
+from taichi_edges.progress import Progress
+from taichi_edges.readers.frames import Frames
 from taichi_edges.readers.images import read_mask
+from taichi_edges.views.edgels import Edgels
 
 RIM_PX = 6  # by which a mask grows: masks are drawn, or made by a network, to some pixels
 EMPTY_RIM_PX = 6  # by which what is empty grows: so far its border disturbs an edge detector
 
 
-def has_areas(frames):
+def has_areas(frames: Frames) -> bool:
     """Whether any view of the frames has a mask, or empty places."""
     return any(frames.mask_paths) or any(frames.valid_paths)
 
 
-def kept_area(mask_path, valid_path, size):
+def kept_area(mask_path: Path | str, valid_path: Path | str, size: tuple[int, int]) -> np.ndarray | None:
     """(H, W) bool: where in a view edgels count; None where they do everywhere. size: (width, height) px."""
     area = None
     if mask_path:
@@ -34,15 +37,15 @@ def kept_area(mask_path, valid_path, size):
     return area
 
 
-def _disc(radius):
+def _disc(radius: int) -> np.ndarray:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
 
 
-def within_masks(edgels, frames, size, progress):
+def within_masks(edgels: Edgels, frames: Frames, size: tuple[int, int], progress: Progress) -> Edgels:
     """The edgels that count, of the frames' views. size: (width, height) px. UserError where none does."""
     keep, masked_out = np.ones(len(edgels), bool), []
-    for view, paths in enumerate(zip(frames.mask_paths, frames.valid_paths, strict=True)):
-        area = kept_area(*map(_path, paths), size)
+    for view, (mask_path, valid_path) in enumerate(zip(frames.mask_paths, frames.valid_paths, strict=True)):
+        area = kept_area(mask_path, valid_path, size)
         if area is None:
             continue
         part = slice(edgels.starts[view], edgels.starts[view + 1])
@@ -58,15 +61,12 @@ def within_masks(edgels, frames, size, progress):
     return edgels.keep(keep)
 
 
-def _path(path):
-    return Path(path) if path else ""
-
-
-def blank_outside(edge_maps, frames):
+def blank_outside(edge_maps: np.ndarray, frames: Frames) -> np.ndarray:
     """The (V, H, W) edge maps, black where edges do not count."""
     blanked = edge_maps.copy()
-    for view, paths in enumerate(zip(frames.mask_paths, frames.valid_paths, strict=True)):
-        area = kept_area(*map(_path, paths), edge_maps.shape[:0:-1])
+    height, width = edge_maps.shape[1:]
+    for view, (mask_path, valid_path) in enumerate(zip(frames.mask_paths, frames.valid_paths, strict=True)):
+        area = kept_area(mask_path, valid_path, (width, height))
         if area is not None:
             blanked[view][~area] = 0
     return blanked

@@ -7,8 +7,10 @@ resampling keeps the pixel centres, padding is at the right and the bottom only,
 import contextlib
 import importlib
 import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -51,8 +53,8 @@ class Preset:
     full: the value of a certain edge, 0 being none, after the sigmoid.
     """
 
-    mean: tuple
-    deviation: tuple = (1.0, 1.0, 1.0)
+    mean: tuple[float, ...]
+    deviation: tuple[float, ...] = (1.0, 1.0, 1.0)
     rgb: bool = False
     multiple: int = 16
     output: int = -1
@@ -81,15 +83,35 @@ class Signature:
     """
 
     input: str
-    size: tuple
-    outputs: tuple
-    makers: tuple
+    size: tuple[int | None, int | None]
+    outputs: tuple[str, ...]
+    makers: tuple[str, ...]
 
 
-def detect_maps(images, model_path, preset=None, scale=1.0, flip=False, threads=None, report=None):
+class Images(Protocol):
+    """What gives images one after the other, and says how many."""
+
+    def __len__(self) -> int: ...
+
+    def __iter__(self) -> Iterator[np.ndarray]: ...
+
+
+Described = tuple[int | None, tuple[int | None, ...]]  # of an input: its element type and its shape
+Message = bytes | memoryview  # of Protocol Buffers
+
+
+def detect_maps(
+    images: Images,
+    model_path: Path | str,
+    preset: Preset | str | None = None,
+    scale: float = 1.0,
+    flip: bool | str = False,
+    threads: int | None = None,
+    report: Progress | None = None,
+) -> list[np.ndarray]:
     """Edge maps of images, (H, W) uint8 each, 255 = certainly an edge; in order.
 
-    images: sequence of (H, W, 3) RGB arrays, uint8 or float in 0..1, alpha composited. model_path: the ONNX file.
+    images: (H, W, 3) RGB arrays, uint8 or float in 0..1, alpha composited. model_path: the ONNX file.
     preset: a key of PRESETS, a Preset, or None: the key that the file's name holds. scale: the network sees the image
     so many times larger; its map is resampled back. flip: average with the mirrored image; "both": mirrored
     horizontally, vertically and both. threads: None for as many as there are. report: Progress.
@@ -110,7 +132,7 @@ def detect_maps(images, model_path, preset=None, scale=1.0, flip=False, threads=
     return maps
 
 
-def preset_for(model_path, preset=None):
+def preset_for(model_path: Path | str, preset: Preset | str | None = None) -> Preset:
     """The Preset of a model: `preset` itself, the row of that name, or the row whose name the file's name holds."""
     if isinstance(preset, Preset):
         return preset
@@ -128,19 +150,21 @@ def preset_for(model_path, preset=None):
     return PRESETS[found[0]]
 
 
-def _detect(image, network, preset, scale, flips):
+def _detect(
+    image: np.ndarray, network: "_Network", preset: Preset, scale: float, flips: Sequence[tuple[int, ...]]
+) -> np.ndarray:
     """(H, W) uint8 of one image."""
     height, width = image.shape[:2]
     seen = (round(width * scale), round(height * scale)) if scale != 1 else (width, height)
     pixels = np.clip(_resampled(_as_pixels(image), seen), 0.0, 255.0)  # cubics overshoot
     ordered = pixels if preset.rgb else pixels[:, :, ::-1]
-    planes = (ordered - np.float32(preset.mean)) / np.float32(preset.deviation)
+    planes = (ordered - np.array(preset.mean, np.float32)) / np.array(preset.deviation, np.float32)
     tile = [
         fixed or min(-(-side // preset.multiple) * preset.multiple, MAX_TILE)
         for side, fixed in zip(planes.shape[:2], network.signature.size, strict=True)
     ]
 
-    def infer(blob):
+    def infer(blob: np.ndarray) -> np.ndarray:
         runs = [np.flip(_as_map(network, np.flip(blob, axes), preset), axes) for axes in flips]
         return np.mean(runs, axis=0)
 
@@ -148,13 +172,13 @@ def _detect(image, network, preset, scale, flips):
     return np.rint(np.clip(_resampled(found, (width, height)), 0.0, 1.0) * 255).astype(np.uint8)
 
 
-def _as_pixels(image):
+def _as_pixels(image: np.ndarray) -> np.ndarray:
     """(H, W, 3) float32 in 0..255."""
     assert image.ndim == 3 and image.shape[2] == 3, image.shape
     return image.astype(np.float32) if image.dtype == np.uint8 else (image * 255.0).astype(np.float32)
 
 
-def _resampled(image, size):
+def _resampled(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """A float32 image brought to `size`, (width, height) px.
 
     cv2.resize lays the borders of the first and last pixels over each other, not their centres, so what is drawn in
@@ -166,7 +190,7 @@ def _resampled(image, size):
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
 
 
-def _in_tiles(planes, tile, infer):
+def _in_tiles(planes: np.ndarray, tile: Sequence[int], infer: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """(h, w) map of an image, in tiles that fade into each other; an image smaller than a tile repeats its border.
 
     planes: (3, h, w) float32. tile: (rows, columns) px. infer: (1, 3, *tile) -> (*tile,).
@@ -178,25 +202,25 @@ def _in_tiles(planes, tile, infer):
     share = np.outer(*(_fade(side) for side in tile))
     for top in _tile_starts(padded.shape[1], tile[0]):
         for left in _tile_starts(padded.shape[2], tile[1]):
-            window = np.s_[top : top + tile[0], left : left + tile[1]]
-            total[window] += share * infer(np.ascontiguousarray(padded[(slice(None), *window)][None]))
-            weight[window] += share
+            rows, columns = slice(top, top + tile[0]), slice(left, left + tile[1])
+            total[rows, columns] += share * infer(np.ascontiguousarray(padded[None, :, rows, columns]))
+            weight[rows, columns] += share
     return (total / weight)[:height, :width]
 
 
-def _tile_starts(size, tile):
+def _tile_starts(size: int, tile: int) -> list[int]:
     """First pixels of tiles that cover `size` pixels and share TILE_OVERLAP or more."""
     count = 1 if size <= tile else -(-(size - TILE_OVERLAP) // (tile - TILE_OVERLAP))
     return [round(start) for start in np.linspace(0, size - tile, count)]
 
 
-def _fade(tile):
+def _fade(tile: int) -> np.ndarray:
     """(tile,) weights: 1, and falling to nearly 0 over the overlap with a neighbour."""
     to_border = np.minimum(np.arange(tile), np.arange(tile)[::-1]) + 0.5
     return np.minimum(to_border / TILE_OVERLAP, 1.0).astype(np.float32)
 
 
-def _as_map(network, blob, preset):
+def _as_map(network: "_Network", blob: np.ndarray, preset: Preset) -> np.ndarray:
     """The network's answer to (1, 3, h, w) as (h, w) float in 0..1."""
     answer = np.asarray(network.forward(np.ascontiguousarray(blob)), dtype=np.float32)
     size, where = blob.shape[2:], f"{network.path}: output '{network.output}'"
@@ -219,17 +243,17 @@ def _as_map(network, blob, preset):
 class _Network:
     """A function from (1, 3, h, w) float32 to one output: by OpenCV, from its first refusal on by onnxruntime."""
 
-    def __init__(self, path, signature, output, threads, report):
+    def __init__(self, path: Path, signature: Signature, output: str, threads: int | None, report: Progress) -> None:
         self.path, self.signature, self.output = path, signature, output
         self.threads, self.report = threads, report
-        self.session = None
+        self.session: Any = None  # onnxruntime's, from OpenCV's first refusal on
         try:
             with _quiet_opencv():
                 self.net = cv2.dnn.readNetFromONNX(str(path))
         except cv2.error as error:
             self._change_over(error)
 
-    def forward(self, blob):
+    def forward(self, blob: np.ndarray) -> np.ndarray:
         """blob: (1, 3, h, w) float32, contiguous. Returns the output as it comes."""
         if self.session is None:
             try:
@@ -243,7 +267,7 @@ class _Network:
         except Exception as error:  # its classes are not part of its interface
             raise self._refused_by_both(error) from error
 
-    def _change_over(self, error):
+    def _change_over(self, error: Exception) -> None:
         self.reason = _condensed(error)
         try:
             runtime = importlib.import_module("onnxruntime")
@@ -258,12 +282,12 @@ class _Network:
         except Exception as second:  # its classes are not part of its interface
             raise self._refused_by_both(second) from second
 
-    def _refused_by_both(self, error):
+    def _refused_by_both(self, error: Exception) -> UserError:
         reasons = f"OpenCV: {self.reason}; onnxruntime: {_condensed(error)}"
         return UserError(f"{self.path}: cannot be run ({reasons}); export the model again, or make the images smaller")
 
 
-def _condensed(error):
+def _condensed(error: Exception) -> str:
     """The reason in another library's message: the operator where it names one, else its last statement."""
     text = " ".join(str(error).split())
     if unknown := re.search(r'of type "(\w+)"', text):
@@ -276,7 +300,7 @@ def _condensed(error):
 
 
 @contextlib.contextmanager
-def _quiet_opencv():
+def _quiet_opencv() -> Iterator[None]:
     """OpenCV logs what it also raises; a user is to read it once."""
     log = cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging  # OpenCV 4 has it here, OpenCV 5 there
     before = log.getLogLevel()
@@ -288,7 +312,7 @@ def _quiet_opencv():
 
 
 @contextlib.contextmanager
-def _opencv_threads(threads):
+def _opencv_threads(threads: int | None) -> Iterator[None]:
     before = cv2.getNumThreads()
     try:
         cv2.setNumThreads(before if threads is None else threads)
@@ -297,7 +321,7 @@ def _opencv_threads(threads):
         cv2.setNumThreads(before)
 
 
-def _output_index(path, signature, preset):
+def _output_index(path: Path | str, signature: Signature, preset: Preset) -> int:
     count = len(signature.outputs)
     if not -count <= preset.output < count:
         problem = f"there is no output {preset.output}; it has {count}, from 0 to {count - 1}"
@@ -305,7 +329,7 @@ def _output_index(path, signature, preset):
     return preset.output
 
 
-def read_signature(path):
+def read_signature(path: Path | str) -> Signature:
     """What an ONNX file declares about its input and outputs; refused unless it maps one RGB image to something.
 
     The file is a Protocol Buffers message (github.com/onnx/onnx: onnx.proto); the few fields wanted are read here.
@@ -331,7 +355,7 @@ def read_signature(path):
     return Signature(name, size, outputs, tuple(makers.get(output, "") for output in outputs))
 
 
-def _image_input(path, inputs):
+def _image_input(path: Path, inputs: dict[str, Described]) -> tuple[str, tuple[int | None, int | None]]:
     """The name of the one input and its (height, width), each None where it is free."""
     if len(inputs) != 1:
         raise UserError(f"{path}: it has {len(inputs)} inputs; an edge detector takes one image")
@@ -341,17 +365,20 @@ def _image_input(path, inputs):
         raise UserError(f"{path}: its input is {described}; one RGB image is 1 x 3 x height x width: export it so")
     if kind != FLOAT32:
         raise UserError(f"{path}: its input is not float32 numbers; export the model in float32")
-    size = shape[2:]
-    if any(side is not None and side < MIN_TILE for side in size):
+    height, width = shape[2:]
+    if any(side is not None and side < MIN_TILE for side in (height, width)):
         problem = f"its input is {described} px, and {MIN_TILE} px are the least"
         raise UserError(f"{path}: {problem}; export it with free height and width (dynamic_axes)")
-    return name, size
+    return name, (height, width)
 
 
-def _declared(content):
+def _declared(content: bytes) -> tuple[dict[str, Described], tuple[str, ...], dict[str, str]]:
     """Inputs {name: (type, shape)}, names of the outputs and {name of a value: operator} of an ONNX model."""
     graphs = [value for number, value in _fields(memoryview(content)) if number == 7]  # ModelProto.graph
-    inputs, outputs, weights, makers = {}, [], set(), {}
+    inputs: dict[str, Described] = {}
+    outputs: list[str] = []
+    weights: set[str] = set()
+    makers: dict[str, str] = {}
     for number, value in _fields(graphs[0]):
         if number == 1:  # GraphProto.node: output = 2, op_type = 4
             node = list(_fields(value))
@@ -368,7 +395,7 @@ def _declared(content):
     return {name: described for name, described in inputs.items() if name not in weights}, tuple(outputs), makers
 
 
-def _value(message):
+def _value(message: Message) -> tuple[str, Described]:
     """Name and (element type, shape with None for what is free) of a ValueInfoProto."""
     parts = dict(_fields(message))
     tensor = dict(_fields(dict(_fields(parts[2]))[1])) if 2 in parts else {}  # type = 2, its tensor_type = 1
@@ -376,12 +403,13 @@ def _value(message):
     return _text(parts[1]), (tensor.get(1), tuple(side if side and 0 < side < MAX_SIDE else None for side in sides))
 
 
-def _text(value):
+def _text(value: Message) -> str:
     return bytes(value).decode("utf-8")
 
 
-def _fields(message):
+def _fields(message: Message) -> Iterator[tuple[int, Any]]:
     """(number, value) of the fields of a Protocol Buffers message; a value is an int or the bytes."""
+    value: int | Message
     place = 0
     while place < len(message):
         key, place = _varint(message, place)
@@ -399,7 +427,7 @@ def _fields(message):
         yield key >> 3, value
 
 
-def _varint(message, place):
+def _varint(message: Message, place: int) -> tuple[int, int]:
     """An integer of 7 bits a byte, the lowest first, and the place behind it."""
     value = shift = 0
     while shift < 64:

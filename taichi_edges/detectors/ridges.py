@@ -5,6 +5,7 @@ A learned detector answers with bands of 2 to 10 pixels. Trained on a band, Gaus
 is defined only up to its width. Its ridge is where the detector means the edge to be.
 """
 
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -23,12 +24,12 @@ HALF_DIAGONAL = 0.72  # px; of a pixel, or a rounding more
 MIN_PIXELS = 6  # a ridge of fewer is no line
 
 
-def _reach(sigma):
+def _reach(sigma: float) -> int:
     """Pixels from which a derivative takes its value, to each side."""
     return int(np.ceil(4 * sigma))
 
 
-def gaussian_derivatives(image, sigma):
+def gaussian_derivatives(image: np.ndarray, sigma: float) -> Iterator[np.ndarray]:
     """First and second derivatives of an (H, W) float32 image smoothed by `sigma` pixels: gx, gy, gxx, gxy, gyy.
 
     They come one after the other, so that whoever wants them at a few pixels does not hold five images.
@@ -47,7 +48,7 @@ def gaussian_derivatives(image, sigma):
         yield cv2.sepFilter2D(image, cv2.CV_32F, along, down, borderType=cv2.BORDER_REPLICATE)
 
 
-def ridge_points(edge_map, sigma, threshold):
+def ridge_points(edge_map: np.ndarray, sigma: float, threshold: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sub-pixel points on the ridges of an edge map.
 
     edge_map: (H, W) uint8. sigma: smoothing scale, pixels. threshold: 0..1; the map's value a ridge needs.
@@ -74,7 +75,9 @@ def ridge_points(edge_map, sigma, threshold):
     return points, np.stack([nx, ny], axis=1)[on_ridge], values[on_ridge]
 
 
-def _is_nearest(shape, sharp, rows, columns, du, dv):
+def _is_nearest(
+    shape: tuple[int, ...], sharp: np.ndarray, rows: np.ndarray, columns: np.ndarray, du: np.ndarray, dv: np.ndarray
+) -> np.ndarray:
     """(n,) bool: which pixels are the nearest to their ridge, (du, dv) px away; of two half-way, one at least."""
     farthest = np.maximum(np.abs(du), np.abs(dv))
     inside = farthest <= 0.5
@@ -88,7 +91,7 @@ def _is_nearest(shape, sharp, rows, columns, du, dv):
     return inside
 
 
-def _window(edge_map, threshold, margin):
+def _window(edge_map: np.ndarray, threshold: float, margin: int) -> tuple[int, int, np.ndarray]:
     """Top row, left column and pixels of the part of a map that holds all its bright pixels, `margin` around them."""
     bright = edge_map >= np.count_nonzero(np.arange(256, dtype=np.float32) / 255.0 < threshold)
     spans = []
@@ -99,13 +102,13 @@ def _window(edge_map, threshold, margin):
     return top, left, edge_map[top:bottom, left:right]
 
 
-def _without_specks(mask, rows, columns):
+def _without_specks(mask: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """(n,) bool: which of the pixels, some of a (H, W) bool mask, are of a connected piece of at least MIN_PIXELS."""
     labels = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)[1][rows, columns]
     return (labels > 0) & (np.bincount(labels) >= MIN_PIXELS)[labels]
 
 
-def trace_ridges(edge_maps, width_px, threshold, threads=None):
+def trace_ridges(edge_maps: np.ndarray, width_px: float, threshold: float, threads: int | None = None) -> Edgels:
     """Edgels on the ridges of edge maps, some of them at a time; strengths are the maps' values there.
 
     edge_maps: (V, H, W) uint8 with lines about `width_px` wide. threshold: 0..1; ridges with lower values are dropped.
@@ -117,11 +120,11 @@ def trace_ridges(edge_maps, width_px, threshold, threads=None):
         return Edgels.of_views(pool.map(lambda edge_map: ridge_points(edge_map, sigma, threshold), edge_maps))
 
 
-def _sigma(width_px):
+def _sigma(width_px: float) -> float:
     return max(MIN_SIGMA, SIGMA_PER_WIDTH * width_px)
 
 
-def single_width(edge_maps, width_px, threshold):
+def single_width(edge_maps: Iterable[np.ndarray], width_px: float, threshold: float) -> float:
     """Typical full width at half maximum, px, of single lines in maps whose lines are about `width_px` wide.
 
     Lines beside each other, as those of thin bars, blend into bands; smoothed as if one line were that wide, they would
@@ -136,13 +139,15 @@ def single_width(edge_maps, width_px, threshold):
     return 2.0 * float(np.median(np.concatenate([*halves, [width_px / 2]])))
 
 
-def _half_width(edge_map, points, directions, reach):
+def _half_width(edge_map: np.ndarray, points: np.ndarray, directions: np.ndarray, reach: float) -> np.ndarray:
     """(n,) px from points (n, 2) on ridges along unit `directions` to half of the map's value; `reach` if beyond."""
     if not len(points):
         return np.zeros(0)
     along = np.arange(0, reach + PROFILE_STEP, PROFILE_STEP)
     places = (points[:, None] + along[:, None] * directions[:, None]).astype(np.float32)
-    profiles = cv2.remap(edge_map, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float64)
+    # OpenCV's types do not know that one map of both coordinates needs no second.
+    profiles = cv2.remap(edge_map, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+    profiles = profiles.astype(np.float64)
     below = profiles < profiles[:, :1] / 2
     first, rows = below.argmax(axis=1), np.arange(len(points))
     before, after, half = profiles[rows, first - 1], profiles[rows, first], profiles[:, 0] / 2

@@ -13,6 +13,7 @@ import taichi as ti
 from taichi_edges.kernels.device import download, upload
 from taichi_edges.kernels.edgel_grid import CELL, EdgelGrid
 from taichi_edges.kernels.points import F32_2D, I32_1D
+from taichi_edges.views.edgels import Edgels
 
 REACH_PX = 8.0  # to either side, at most a cell
 BESIDE_PX, BEND = 0.5, 1 / 80  # an edgel so far beside, and a bend of radius 40 px, are still the same edge
@@ -54,7 +55,7 @@ def measure_normals(rows: ti.i32, columns: ti.i32, starts: I32_1D, cells: I32_1D
             normals[e, 0], normals[e, 1] = (a - slope * b) / length, (b + slope * a) / length
 
 
-def with_smooth_normals(edgels, height, width, rounds=2):
+def with_smooth_normals(edgels: Edgels, height: int, width: int, rounds: int = 2) -> Edgels:
     """The Edgels with the normals of the edge around each. The later rounds choose what is around by better ones.
 
     ti.init must have been called. height, width: pixels.

@@ -16,9 +16,11 @@ A coarse scale adds what the finer ones did not find: edges that drown in noise,
 """
 
 import os
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -74,7 +76,7 @@ class Field:
     sigma: float
 
     @property
-    def blur(self):
+    def blur(self) -> float:
         """Pixels: the Gaussian that a sharp edge has become."""
         return float(np.hypot(self.sigma, PIXEL_SIGMA))
 
@@ -93,15 +95,20 @@ class Maxima:
     normals: np.ndarray
     ratios: np.ndarray
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.rows)
 
-    def take(self, chosen):
+    def take(self, chosen: np.ndarray) -> "Maxima":
         """Some of them, by index or mask."""
         return Maxima(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
 
-def trace_pictures(paths, threads=None, report=None, exponent=None):
+def trace_pictures(
+    paths: Iterable[Path | str],
+    threads: int | None = None,
+    report: Callable[[int], None] | None = None,
+    exponent: float | None = None,
+) -> tuple[Edgels, list[tuple[int, int] | None]]:
     """Edgels of images, a few of which are held at a time, and the (width, height) of each, px, None without one.
 
     paths: (V,) image files, '' for a view without one, which has no edgels. threads: None for one per core; the
@@ -109,7 +116,7 @@ def trace_pictures(paths, threads=None, report=None, exponent=None):
     UserError where an image cannot be read.
     """
 
-    def trace(path):
+    def trace(path: Path | str) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[int, int] | None]:
         if not path:
             return _arrays([]), None
         picture = read_picture(path, exponent)
@@ -129,7 +136,7 @@ def trace_pictures(paths, threads=None, report=None, exponent=None):
     return Edgels.of_views(views), sizes
 
 
-def detect_edgels(image):
+def detect_edgels(image: Picture | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Edgels of one image: a Picture, or an array that `as_picture` accepts.
 
     Returns points (n, 2) as (u, v), pixel centres at integers, 0.7 to 1.4 for each pixel of an edge's length; unit
@@ -141,7 +148,7 @@ def detect_edgels(image):
     if min(shape) <= 2 * MARGIN:
         return _arrays([])
     taken = np.zeros(shape, bool)  # pixels with an edgel
-    layers = []
+    layers: list[Maxima] = []
     for field in _fields(picture):
         edges, runs = _chained(_maxima(field, _clutter(field)), shape, field.blur)
         free = ~_beside_taken(taken, edges, 1.5 * field.sigma)
@@ -150,7 +157,7 @@ def detect_edgels(image):
     return _arrays(layers)
 
 
-def _arrays(layers):
+def _arrays(layers: list[Maxima]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points (n, 2), normals (n, 2) and strengths (n,) of several Maxima."""
     points, normals = (
         np.concatenate([np.zeros((0, 2)), *(getattr(layer, name) for layer in layers)])
@@ -160,7 +167,7 @@ def _arrays(layers):
     return points, normals, ratios / (ratios + HALF_SURE)
 
 
-def _fields(picture):
+def _fields(picture: Picture) -> Iterator[Field]:
     """The Fields of a picture, one after the other: the outline, then the colours from fine to coarse."""
     coverage, light = picture.coverage, picture.light
     if coverage is not None:
@@ -172,12 +179,14 @@ def _fields(picture):
         yield Field(*gradients, levels_per_light(mean, picture.exponent), sigma)
 
 
-def _smooth(image, sigma):
+def _smooth(image: np.ndarray, sigma: float) -> np.ndarray:
     size = 2 * int(np.ceil(3 * sigma)) + 1
     return cv2.GaussianBlur(image, (size, size), sigma, borderType=cv2.BORDER_REPLICATE)
 
 
-def _derivatives(light, coverage, sigma):
+def _derivatives(
+    light: np.ndarray, coverage: np.ndarray | None, sigma: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Derivatives of the light along x and y, and its mean, each (H, W) or (H, W, 3), smoothed by `sigma` pixels.
 
     Where the object covers a part of the pixels, only that part counts (normalised convolution: Knutsson and Westin,
@@ -188,7 +197,7 @@ def _derivatives(light, coverage, sigma):
         return gx, gy, _smooth(light, sigma)
     share = _smooth(coverage, sigma)
     inverse = np.where(share > MIN_COVERAGE, 1 / np.maximum(share, MIN_COVERAGE), 0).astype(np.float32)
-    of_coverage = islice(gaussian_derivatives(coverage, sigma), 2)
+    of_coverage: Iterator[np.ndarray] = islice(gaussian_derivatives(coverage, sigma), 2)
     if light.ndim == 3:
         coverage, inverse = coverage[:, :, None], inverse[:, :, None]
         of_coverage = (own[:, :, None] for own in of_coverage)
@@ -199,7 +208,7 @@ def _derivatives(light, coverage, sigma):
     return gx, gy, mean
 
 
-def _steepest(gx, gy, mean):
+def _steepest(gx: np.ndarray, gy: np.ndarray, mean: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Gradient (gx, gy), (H, W) each, of the colour in which it is steepest, and the mean brightness (H, W)."""
     if gx.ndim == 2:
         return (gx, gy), mean
@@ -213,7 +222,7 @@ def _steepest(gx, gy, mean):
     return (x, y), np.ascontiguousarray(mean[:, :, 0])
 
 
-def _clutter(field):
+def _clutter(field: Field) -> np.ndarray:
     """(H, W) float32: grey levels per pixel by which the gradient varies along the edges, or rounding varies it.
 
     That is the root of the smaller eigenvalue of the structure tensor. The mean is geometric: corners count little.
@@ -229,7 +238,7 @@ def _clutter(field):
     return cv2.resize(np.exp(logs), (width, height), interpolation=cv2.INTER_LINEAR)
 
 
-def _maxima(field, clutter):
+def _maxima(field: Field, clutter: np.ndarray) -> Maxima:
     """Maxima of the gradient along its own direction that stand out of the clutter, (H, W), at least LOW times."""
     squares = field.gx**2 + field.gy**2
     rows, columns = _candidates(field, squares, clutter)
@@ -245,7 +254,7 @@ def _maxima(field, clutter):
     return Maxima(rows, columns, points, normals, ratios).take(ratios > LOW)
 
 
-def _candidates(field, squares, clutter):
+def _candidates(field: Field, squares: np.ndarray, clutter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns (n,) of the pixels whose gradient is larger than those before and behind it.
 
     The two are interpolated between the pixels where the gradient's direction meets the ring of eight around it.
@@ -266,7 +275,7 @@ def _candidates(field, squares, clutter):
     return rows[top], columns[top]
 
 
-def _offsets(squares, rows, columns, normals):
+def _offsets(squares: np.ndarray, rows: np.ndarray, columns: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(n,) pixels from the pixel's centre to the maximum along the normal; infinite where there is none.
 
     The gradient across a blurred step is a Gaussian, the logarithm of which is a parabola: differences over the eight
@@ -287,7 +296,7 @@ def _offsets(squares, rows, columns, normals):
     return np.divide(-slope, curvature, out=np.full(len(rows), np.inf, np.float32), where=curvature < 0)
 
 
-def _beside(field, rows, columns, normals):
+def _beside(field: Field, rows: np.ndarray, columns: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(n,) mean of the gradients on both sides of the edges, along their normals."""
     height, width = field.gx.shape
     total = np.zeros(len(rows))
@@ -298,7 +307,7 @@ def _beside(field, rows, columns, normals):
     return total / 2
 
 
-def _chained(maxima, shape, blur):
+def _chained(maxima: Maxima, shape: tuple[int, ...], blur: float) -> tuple[Maxima, np.ndarray]:
     """The Maxima that are edges, along their chains, ratios averaged there; and (n,) int, the run each belongs to.
 
     Where the edge is curved, blurring by `blur` pixels moved it inwards by half of blur^2 / radius; it is moved back.
@@ -308,7 +317,7 @@ def _chained(maxima, shape, blur):
     order, low, high = _ordered(*_links(maxima, shape))
     maxima = maxima.take(order)
 
-    def mean(values):
+    def mean(values: np.ndarray) -> np.ndarray:
         sums = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
         return (sums[high] - sums[low]) / (high - low)
 
@@ -325,7 +334,7 @@ def _chained(maxima, shape, blur):
     return smoothed.take(kept), runs[kept]
 
 
-def _curvatures(maxima, first, last):
+def _curvatures(maxima: Maxima, first: np.ndarray, last: np.ndarray) -> np.ndarray:
     """(n,) 1 / pixels, positive where the normals point away from the centre: from the two ends of each window.
 
     On a circle the normals differ by the chord over the radius, however long it is.
@@ -337,7 +346,7 @@ def _curvatures(maxima, first, last):
     return np.where(squares > MIN_CHORD**2, curvatures, 0.0).clip(-MAX_CURVATURE, MAX_CURVATURE)
 
 
-def _links(maxima, shape):
+def _links(maxima: Maxima, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """(n,) index of the next maximum of the chain, light on one side throughout, -1 at its end; the same backwards.
 
     Two are linked when each is the best of the other's neighbours; over a gap of one pixel where there is no nearer.
@@ -361,7 +370,9 @@ def _links(maxima, shape):
     return ahead, behind
 
 
-def _offer(columns, ours, others, costs, partners):
+def _offer(
+    columns: list[np.ndarray], ours: np.ndarray, others: np.ndarray, costs: np.ndarray, partners: np.ndarray
+) -> None:
     """Take each of the others for the neighbour of ours where it is better than the one so far; changes both arrays.
 
     columns: u, v of the points and of the normals, (n,) each. ours, others: (m,) indices. costs, partners: (2, n), of
@@ -380,7 +391,7 @@ def _offer(columns, ours, others, costs, partners):
         partners[side, ours[better]] = others[better]
 
 
-def _ordered(ahead, behind):
+def _ordered(ahead: np.ndarray, behind: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(n,) the maxima chain by chain, in order; and, in that order, (n,) the window of each, low .. high - 1."""
     count = len(ahead)
     linked = np.flatnonzero(ahead >= 0)
@@ -403,7 +414,7 @@ def _ordered(ahead, behind):
     return order, np.maximum(here - WINDOW, starts[label]), np.minimum(here + WINDOW + 1, ends[label])
 
 
-def _beside_taken(taken, maxima, reach):
+def _beside_taken(taken: np.ndarray, maxima: Maxima, reach: float) -> np.ndarray:
     """(n,) bool: is one of the pixels across each edge, up to `reach` away, taken? taken: (H, W) bool."""
     height, width = taken.shape
     result = np.zeros(len(maxima), bool)
@@ -413,7 +424,7 @@ def _beside_taken(taken, maxima, reach):
     return result
 
 
-def _long_runs(free, runs):
+def _long_runs(free: np.ndarray, runs: np.ndarray) -> np.ndarray:
     """(n,) bool: which of the free edgels (n,) have MIN_RUN free ones in a row. runs: (n,) int, ascending."""
     breaks = np.concatenate([[False], (free[1:] != free[:-1]) | (runs[1:] != runs[:-1])])[: len(free)]
     parts = np.cumsum(breaks)

@@ -5,6 +5,10 @@ its writer takes fields named `scale` for linear and clamps negative ones, where
 and its line sets have no properties beyond colours.
 """
 
+from collections.abc import Iterable, Sequence
+from io import BufferedReader
+from pathlib import Path
+
 import numpy as np
 
 from taichi_edges.errors import UserError, name_some
@@ -21,27 +25,28 @@ PLY_TYPES = {np.dtype(NUMPY_TYPES[name]): name for name in ("uchar", "int", "flo
 LONGEST_HEADER = 1 << 16  # bytes; a foreign file is given up after so many
 
 
-def write_float_vertices(path, names, columns):
+def write_float_vertices(path: Path | str, names: Sequence[str], columns: np.ndarray) -> Path:
     """Write a PLY whose vertices carry the float32 properties `names`. columns: (n, len(names))."""
     columns = np.ascontiguousarray(columns, dtype="<f4")
     assert columns.ndim == 2 and columns.shape[1] == len(names), columns.shape
     return write_elements(path, {"vertex": columns.view([(name, "<f4") for name in names])[:, 0]})
 
 
-def write_elements(path, elements):
+def write_elements(path: Path | str, elements: dict[str, np.ndarray]) -> Path:
     """Write a PLY of one element for each entry: its name, and a structured array (n,) of its properties."""
     header = "ply\nformat binary_little_endian 1.0\n"
     for element, rows in elements.items():
         header += f"element {element} {len(rows)}\n"
+        assert rows.dtype.names, element
         header += "".join(f"property {PLY_TYPES[rows.dtype[name]]} {name}\n" for name in rows.dtype.names)
     with replacing(path) as unfinished, open(unfinished, "wb") as file:
         file.write((header + "end_header\n").encode("ascii"))
         for rows in elements.values():
             file.write(rows.tobytes())
-    return path
+    return Path(path)
 
 
-def read_vertices(path, required):
+def read_vertices(path: Path | str, required: Iterable[str]) -> np.ndarray:
     """Read the vertices of a PLY file, which must carry the properties named in `required`.
 
     Returns a structured array (n,) with one field for each property of the file.
@@ -63,14 +68,14 @@ def read_vertices(path, required):
     return np.frombuffer(body, vertex_type)
 
 
-def stack_fields(vertices, names):
+def stack_fields(vertices: np.ndarray, names: Iterable[str]) -> np.ndarray:
     """The named fields of a structured array (n,) side by side: (n, len(names)), of the first field's type."""
     return np.stack([vertices[name] for name in names], axis=1)
 
 
-def _read_header(file):
+def _read_header(file: BufferedReader) -> list[str]:
     """The lines of the header up to `end_header`; the file is left at the first byte of the vertices."""
-    lines = []
+    lines: list[str] = []
     while file.tell() < LONGEST_HEADER:
         line = file.readline(LONGEST_HEADER).decode("ascii", "replace").strip()
         if not lines and line != "ply":
@@ -83,7 +88,7 @@ def _read_header(file):
     raise ValueError("its header has no end")
 
 
-def _parse_header(lines):
+def _parse_header(lines: list[str]) -> tuple[int, np.dtype]:
     """The number of vertices and the dtype of one vertex."""
     words = [line.split() for line in lines if line]
     if ["format", "binary_little_endian", "1.0"] not in words:

@@ -1,5 +1,7 @@
 """Gaussians as a PLY with the field names of 3D Gaussian Splatting: opens in any splat viewer."""
 
+from pathlib import Path
+
 import numpy as np
 
 from taichi_edges.files.ply import read_vertices, stack_fields, write_float_vertices
@@ -16,7 +18,9 @@ HARMONIC_0 = 0.28209479  # the constant spherical harmonic: rgb = 0.5 + HARMONIC
 SPLAT_RGB = (1.0, 0.5, 0.1)  # our Gaussians have no colour of their own; orange shows on black and on white
 
 
-def write_gaussians(path, means, log_scales, quaternions, opacity_logits):
+def write_gaussians(
+    path: Path | str, means: np.ndarray, log_scales: np.ndarray, quaternions: np.ndarray, opacity_logits: np.ndarray
+) -> Path:
     """Write Gaussians as a binary little-endian PLY of float32 fields named as 3D Gaussian Splatting names them.
 
     means: (n, 3) world units. log_scales: (n, 3) natural logarithm of world units. quaternions: (n, 4) as
@@ -30,7 +34,7 @@ def write_gaussians(path, means, log_scales, quaternions, opacity_logits):
     return write_float_vertices(path, FIELDS, np.concatenate([np.asarray(c, np.float32) for c in columns], axis=1))
 
 
-def read_gaussians(path):
+def read_gaussians(path: Path | str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Read a Gaussian Splatting PLY, ours or another's (colours and further harmonics are left out).
 
     Returns means (n, 3), log_scales (n, 3), quaternions (n, 4) and opacity_logits (n,), all float32.

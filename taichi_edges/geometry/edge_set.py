@@ -1,9 +1,13 @@
 """EdgeSet: edges as EMAP has them, lines and cubics, with their samples; and EMAP's keys of the file `edges.json`."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from taichi_edges.errors import UserError
 from taichi_edges.files.artefacts import write_json
@@ -27,39 +31,41 @@ class EdgeSet:
     curve_sources: np.ndarray
 
     @staticmethod
-    def of(lines=(), curves=()):
+    def of(lines: ArrayLike = (), curves: ArrayLike = ()) -> "EdgeSet":
         """An EdgeSet in which every line and every curve is an edge of its own."""
         lines = np.asarray(lines, dtype=np.float64).reshape(-1, 2, 3)
         curves = np.asarray(curves, dtype=np.float64).reshape(-1, 4, 3)
         return EdgeSet(lines, curves, np.arange(len(lines)), len(lines) + np.arange(len(curves)))
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.lines) + len(self.curves)
 
     @property
-    def lengths(self):
+    def lengths(self) -> np.ndarray:
         """(L + C,) arc lengths, lines first."""
         return np.concatenate(
             [np.linalg.norm(self.lines[:, 1] - self.lines[:, 0], axis=1), bezier_lengths(self.curves)]
         )
 
-    def transformed(self, function):
+    def transformed(self, function: Callable[[np.ndarray], np.ndarray]) -> "EdgeSet":
         """The same edges with `function`, (n, 3) -> (n, 3), an affine map, applied to every point."""
         lines = function(self.lines.reshape(-1, 3)).reshape(-1, 2, 3)
         curves = function(self.curves.reshape(-1, 3)).reshape(-1, 4, 3)
         return EdgeSet(lines, curves, self.line_sources, self.curve_sources)
 
-    def polylines(self, curve_segments=32):
+    def polylines(self, curve_segments: int = 32) -> list[np.ndarray]:
         """One (m, 3) polyline for each edge, lines first."""
         parameters = np.linspace(0.0, 1.0, curve_segments + 1)
         return list(self.lines) + [evaluate_bezier(control, parameters) for control in self.curves]
 
-    def sample(self, spacing):
+    def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points at most `spacing` apart along every edge (both end points included), with unit tangents.
 
         Returns points (n, 3), tangents (n, 3) and (n,) the index of the edge, lines first.
         """
-        points, tangents, owners = [], [], []
+        points: list[np.ndarray] = []
+        tangents: list[np.ndarray] = []
+        owners: list[np.ndarray] = []
         for index, polyline in enumerate(self.polylines()):
             steps = np.linalg.norm(np.diff(polyline, axis=0), axis=1)
             arc = np.concatenate([[0.0], np.cumsum(steps)])
@@ -74,7 +80,7 @@ class EdgeSet:
         return np.concatenate(points), np.concatenate(tangents), np.concatenate(owners)
 
 
-def write_edges(path, edges, about):
+def write_edges(path: Path | str, edges: EdgeSet, about: dict[str, Any]) -> Path:
     """Write `edges.json`: EMAP's keys `curves_ctl_pts` (n, 4, 3) and `lines_end_pts` (n, 2, 3), and keys of our own.
 
     edges: EdgeSet in the frame of the input. about: dict of further top-level keys (counts, units), JSON values only.
@@ -89,7 +95,7 @@ def write_edges(path, edges, about):
     return write_json(path, content)
 
 
-def read_edges(path):
+def read_edges(path: Path | str) -> tuple[EdgeSet, dict[str, Any]]:
     """Read an `edges.json` of ours or of EMAP's (which has no sources: there every piece is an edge of its own).
 
     Returns the EdgeSet and the dict of all the other keys.
@@ -114,7 +120,7 @@ def read_edges(path):
     return edges, content
 
 
-def _points(path, content, key, count):
+def _points(path: Path | str, content: dict[str, Any], key: str, count: int) -> np.ndarray:
     """Takes the (n, count, 3) points of every edge out of an edge file's content."""
     values = content.pop(key)
     try:
@@ -127,7 +133,7 @@ def _points(path, content, key, count):
     return points.reshape(-1, count, 3)
 
 
-def _sources(path, content, key, count):
+def _sources(path: Path | str, content: dict[str, Any], key: str, count: int) -> np.ndarray:
     """Takes the edge numbers of `count` lines or curves out of an edge file's content."""
     values = content.pop(key)
     if not isinstance(values, list) or not all(type(value) is int for value in values):

@@ -12,14 +12,17 @@ line_sources, curve_sources
                 the edge that each of EMAP's lines and cubics is a piece of.
 """
 
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from operator import index
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from taichi_edges.errors import UserError
 from taichi_edges.geometry.edge_set import EdgeSet, read_edges, write_edges
-from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
+from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline
 
 
 @dataclass(frozen=True)
@@ -40,8 +43,8 @@ class Evidence:
 class Edge:
     """shape: Line, EllipticArc or Spline. vertices: indices of the two it ends in, () if closed. evidence: or None."""
 
-    shape: Line | EllipticArc | Spline
-    vertices: tuple = ()
+    shape: Shape
+    vertices: tuple[int, ...] = ()
     evidence: Evidence | None = None
 
 
@@ -49,16 +52,16 @@ class Edge:
 class Wireframe:
     """A graph of edges.
 
-    vertices: (V, 3). edges: tuple of Edge. contacts: (k, 2) int, vertex and an edge it lies on between its ends.
+    vertices: (V, 3). edges: in order. contacts: (k, 2) int, vertex and an edge it lies on between its ends.
     An edge's shape ends exactly in its vertices.
     """
 
     vertices: np.ndarray
-    edges: tuple
+    edges: tuple[Edge, ...]
     contacts: np.ndarray
 
     @staticmethod
-    def loose(shapes):
+    def loose(shapes: Iterable[Shape]) -> "Wireframe":
         """The Wireframe in which every shape is an edge that meets no other."""
         vertices, edges = [np.zeros((0, 3))], []
         for shape in shapes:
@@ -68,25 +71,25 @@ class Wireframe:
                 vertices.append(shape.ends)
         return Wireframe(np.concatenate(vertices), tuple(edges), np.zeros((0, 2), np.int64))
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.edges)
 
     @property
-    def shapes(self):
+    def shapes(self) -> list[Shape]:
         """The shapes of the edges, in order."""
         return [edge.shape for edge in self.edges]
 
     @property
-    def degrees(self):
+    def degrees(self) -> np.ndarray:
         """(V,) how many edges meet in each vertex: those that end there, and those it lies on."""
         ends = [end for edge in self.edges for end in edge.vertices]
         meeting = np.concatenate([np.array(ends, np.int64), self.contacts[:, 0]])
         return np.bincount(meeting, minlength=len(self.vertices))
 
-    def edge_set(self):
+    def edge_set(self) -> EdgeSet:
         """The same as an EdgeSet, whose sources are the indices of the edges."""
-        lines = [(number, shape) for number, shape in enumerate(self.shapes) if shape.kind == "line"]
-        curves = [(number, shape.cubics()) for number, shape in enumerate(self.shapes) if shape.kind != "line"]
+        lines = [(number, shape) for number, shape in enumerate(self.shapes) if isinstance(shape, Line)]
+        curves = [(number, shape.cubics()) for number, shape in enumerate(self.shapes) if not isinstance(shape, Line)]
         return EdgeSet(
             np.array([shape.points for _, shape in lines]).reshape(-1, 2, 3),
             np.concatenate([np.zeros((0, 4, 3)), *(cubics for _, cubics in curves)]),
@@ -94,18 +97,18 @@ class Wireframe:
             np.array([number for number, cubics in curves for _ in cubics], dtype=np.int64),
         )
 
-    def keep(self, chosen):
+    def keep(self, chosen: np.ndarray) -> "Wireframe":
         """Only the chosen edges, (E,) bool, and the vertices that these end in."""
         kept = np.flatnonzero(chosen)
         used = np.unique([end for number in kept for end in self.edges[number].vertices]).astype(np.int64)
         vertex, edge = np.full(len(self.vertices), -1), np.full(len(self.edges), -1)
         vertex[used], edge[kept] = np.arange(len(used)), np.arange(len(kept))
-        edges = (self.edges[number] for number in kept)
-        edges = tuple(replace(old, vertices=tuple(int(vertex[end]) for end in old.vertices)) for old in edges)
+        chosen_edges = (self.edges[number] for number in kept)
+        edges = tuple(replace(old, vertices=tuple(int(vertex[end]) for end in old.vertices)) for old in chosen_edges)
         contacts = np.stack([vertex[self.contacts[:, 0]], edge[self.contacts[:, 1]]], axis=1)
         return Wireframe(self.vertices[used], edges, contacts[(contacts >= 0).all(axis=1)])
 
-    def transformed(self, function, scale):
+    def transformed(self, function: Callable[[np.ndarray], np.ndarray], scale: float) -> "Wireframe":
         """The same wireframe with `function`, a similarity (n, 3) -> (n, 3), applied. scale: by which lengths grow."""
         edges = []
         for edge in self.edges:
@@ -116,7 +119,7 @@ class Wireframe:
         return Wireframe(function(self.vertices), tuple(edges), self.contacts)
 
 
-def write_wireframe(path, wireframe, about):
+def write_wireframe(path: Path | str, wireframe: Wireframe, about: dict[str, Any]) -> Path:
     """Write `edges.json`, see above. wireframe: in the frame of the input. about: further keys, JSON values only."""
     graph = {
         "vertices": wireframe.vertices.tolist(),
@@ -126,7 +129,7 @@ def write_wireframe(path, wireframe, about):
     return write_edges(path, wireframe.edge_set(), {**graph, **about})
 
 
-def read_wireframe(path):
+def read_wireframe(path: Path | str) -> tuple[Wireframe, dict[str, Any]]:
     """The Wireframe of an `edges.json`, and the dict of its other keys.
 
     A file without the keys of the graph (EMAP's) gives loose edges, each source a line or a chain of cubics.
@@ -148,18 +151,19 @@ def read_wireframe(path):
     return Wireframe(vertices, found, contacts), content
 
 
-def _described(edge):
+def _described(edge: Edge) -> dict[str, Any]:
     """An Edge as JSON values."""
-    shape, text = edge.shape, {"kind": edge.shape.kind, "vertices": list(edge.vertices)}
+    shape = edge.shape
+    text: dict[str, Any] = {"kind": shape.kind, "vertices": list(edge.vertices)}
     if isinstance(shape, EllipticArc):
         text |= {"centre": shape.centre.tolist(), "half_axes": shape.axes.tolist()}
         text["angles_rad"] = [shape.low, shape.high]
-    if shape.kind == "spline":
+    if isinstance(shape, Spline):
         text["closed"] = shape.closed
     return text | (asdict(edge.evidence) if edge.evidence else {})
 
 
-def _undescribed(number, described, edges):
+def _undescribed(number: int, described: dict[str, Any], edges: EdgeSet) -> Edge:
     """The Edge of JSON values; `edges` is the EdgeSet that holds its points. ValueError and others if it is none."""
     evidence, vertices = None, tuple(index(end) for end in described["vertices"])
     if "confidence" in described:
@@ -171,7 +175,7 @@ def _undescribed(number, described, edges):
     return Edge(shape, vertices, evidence)
 
 
-def _shape_of(number, described, edges):
+def _shape_of(number: int, described: dict[str, Any], edges: EdgeSet) -> Shape:
     """The shape of an edge of which all is given as JSON values, except the points in `edges`."""
     if "half_axes" in described:
         centre, axes = (np.array(described[key], dtype=np.float64) for key in ("centre", "half_axes"))
@@ -184,10 +188,11 @@ def _shape_of(number, described, edges):
     return Spline(curves, bool(described["closed"]))
 
 
-def _shapes_of_sources(edges):
+def _shapes_of_sources(edges: EdgeSet) -> list[Shape]:
     """The shapes of an EdgeSet without a graph."""
-    chains = {}
+    chains: dict[int, list[np.ndarray]] = {}
     for source, curve in zip(edges.curve_sources.tolist(), edges.curves, strict=True):
         chains.setdefault(source, []).append(curve)
     splines = [np.array(chain) for chain in chains.values()]
-    return [Line(ends) for ends in edges.lines] + [Spline(s, bool((s[0, 0] == s[-1, 3]).all())) for s in splines]
+    closed = (bool((s[0, 0] == s[-1, 3]).all()) for s in splines)
+    return [*map(Line, edges.lines), *map(Spline, splines, closed)]

@@ -15,7 +15,7 @@ from taichi_edges.errors import UserError
 STALE_LOCK = 60.0  # seconds; Taichi holds the lock of its kernel cache for some milliseconds
 
 
-def start_taichi(arch, threads, seed, cache):
+def start_taichi(arch: str, threads: int, seed: int, cache: Path | str) -> None:
     """ti.init for this project: f32, quiet, kernels cached in the folder `cache` (not at all where it is read-only).
 
     What an earlier program held on the device is freed. arch: 'cpu', 'cuda' or 'vulkan'. UserError where the machine
@@ -40,7 +40,7 @@ def start_taichi(arch, threads, seed, cache):
         raise UserError(f"--arch {arch}: this machine offers Taichi no {arch} device; use --arch cpu")
 
 
-def _is_writable(folder):
+def _is_writable(folder: Path) -> bool:
     """Whether files can be written to a folder, which is made where it is not there."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -50,7 +50,7 @@ def _is_writable(folder):
         return False
 
 
-def release_cache(cache):
+def release_cache(cache: Path) -> None:
     """Remove the lock that a killed process has left in the kernel cache: with it nothing is read from there again.
 
     Processes that run at the same time take turns by that lock; one held for STALE_LOCK is nobody's.
@@ -61,7 +61,7 @@ def release_cache(cache):
             lock.unlink()
 
 
-def is_running(arch, threads):
+def is_running(arch: str, threads: int) -> bool:
     """Whether Taichi runs on this arch ('cpu', 'cuda' or 'vulkan') with this number of CPU threads, and in f32."""
     if ti.lang.impl.get_runtime().prog is None:
         return False
@@ -70,12 +70,12 @@ def is_running(arch, threads):
     return (running.arch, running.cpu_max_num_threads, running.default_fp) == wanted
 
 
-def threads():
+def threads() -> int:
     """The number of CPU threads Taichi was started with."""
     return ti.lang.impl.current_cfg().cpu_max_num_threads
 
 
-def upload(array):
+def upload(array: np.ndarray) -> np.ndarray | ti.Ndarray:
     """What kernels take for a NumPy array: on a CPU the array itself, on a GPU a copy in its memory."""
     array = np.ascontiguousarray(array)
     if ti.lang.impl.current_cfg().arch == ti.cpu:
@@ -85,6 +85,6 @@ def upload(array):
     return copy
 
 
-def download(array):
+def download(array: np.ndarray | ti.Ndarray) -> np.ndarray:
     """What kernels have written to the `upload` of an array, as a NumPy array."""
     return array if isinstance(array, np.ndarray) else array.to_numpy()

@@ -1,8 +1,13 @@
 """The edgels of all views in a grid of cells, for look-ups by kernels."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from taichi_edges.kernels.device import upload
+
+if TYPE_CHECKING:
+    from taichi_edges.views.edgels import Edgels
 
 CELL = 8  # px; side of the cells in which edgels are looked up, at least the largest radius
 
@@ -15,7 +20,7 @@ class EdgelGrid:
     none. rows, columns: cells in a view.
     """
 
-    def __init__(self, edgels, height, width):
+    def __init__(self, edgels: "Edgels", height: int, width: int) -> None:
         self.rows, self.columns = -(-height // CELL), -(-width // CELL)
         inside = np.clip(np.floor(edgels.points / CELL).astype(np.int64), 0, [self.columns - 1, self.rows - 1])
         cells = (edgels.views * self.rows + inside[:, 1]) * self.columns + inside[:, 0]

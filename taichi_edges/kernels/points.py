@@ -1,5 +1,6 @@
 """What kernels over points and views share: argument types, cameras, points and the pixels they fall on."""
 
+import numpy as np
 import taichi as ti
 
 WORD = 32  # points in a word that holds one bit of each
@@ -10,7 +11,7 @@ I32_1D, I32_2D = ti.types.ndarray(dtype=ti.i32, ndim=1), ti.types.ndarray(dtype=
 I32_3D, U32_2D = ti.types.ndarray(dtype=ti.i32, ndim=3), ti.types.ndarray(dtype=ti.u32, ndim=2)
 
 
-def blocks_of(points):
+def blocks_of(points: np.ndarray | ti.Ndarray) -> tuple[int, int]:
     """How kernels divide the n points of an array: (points of a block, number of blocks), their first arguments.
 
     On a CPU a camera is loaded once for a whole block; on a GPU every point has a thread of its own. An argument, and

@@ -5,6 +5,8 @@ the frame of the ground truth. Images are PNG or, in Replica_Edge, JPEG, the map
 """
 
 from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,10 +14,13 @@ from taichi_edges.errors import UserError
 from taichi_edges.readers.companions import companion, edge_paths, mask_paths
 from taichi_edges.readers.frames import Frames, matrix, read_json
 
+if TYPE_CHECKING:
+    from taichi_edges.scene.settings import SourceConfig
+
 IMAGE_FOLDERS = ("color", "images", "image", "rgb")
 
 
-def read_emap(path, config):
+def read_emap(path: Path, config: "SourceConfig") -> Frames:
     """Frames of an EMAP folder, or of a file like its meta_data.json. config: the scene's `source` section."""
     where = path if path.is_file() else path / "meta_data.json"
     folder = where.parent
@@ -29,7 +34,7 @@ def read_emap(path, config):
     return Frames(
         where=where,
         names=[name.rsplit(".", 1)[0] for name in names],
-        edge_paths=edge_paths(folder / config.edges, names) if config.edges else [""] * len(names),
+        edge_paths=edge_paths(folder, config, names),
         image_paths=[companion(folder / images, name) or folder / images / name if images else "" for name in names],
         intrinsics=[partial(_intrinsics, frame, name, where) for frame, name in zip(frames, names, strict=True)],
         camera_to_world=[frame.get("camtoworld") for frame in frames],
@@ -42,13 +47,13 @@ def read_emap(path, config):
     )
 
 
-def _name(frame, where):
+def _name(frame: Any, where: Path) -> str:
     if not isinstance(frame, dict) or not isinstance(frame.get("rgb_path"), str) or not frame["rgb_path"]:
         raise UserError(f"{where}: a frame without rgb_path; every frame names its image")
     return frame["rgb_path"]
 
 
-def _input_to_truth(content, where):
+def _input_to_truth(content: dict[str, Any], where: Path) -> np.ndarray:
     values = matrix(content.get("worldtogt", np.eye(4)), (4, 4), where, "worldtogt")
     if not np.isfinite(values).all():
         raise UserError(f"{where}: worldtogt holds values that are not finite; correct it or leave it out")
@@ -57,7 +62,7 @@ def _input_to_truth(content, where):
     return values
 
 
-def _scene_box(content, where):
+def _scene_box(content: dict[str, Any], where: Path) -> np.ndarray | None:
     """(2, 3) corners of the box the file gives, None without one."""
     box = content.get("scene_box")
     if not isinstance(box, dict) or box.get("aabb") is None:
@@ -68,17 +73,17 @@ def _scene_box(content, where):
     return corners
 
 
-def _intrinsics(frame, name, where, width, height):
+def _intrinsics(frame: dict[str, Any], name: str, where: Path, width: int, height: int) -> np.ndarray:
     """The 3x3 part of EMAP's 3x3 or 4x4 intrinsics, whatever the image size."""
     values = np.asarray(frame.get("intrinsics"), dtype=object)
     rows = 4 if values.shape == (4, 4) else 3
     return matrix(frame.get("intrinsics"), (rows, rows), where, f"intrinsics of {name}")[:3, :3]
 
 
-def _size(content, where):
+def _size(content: dict[str, Any], where: Path) -> tuple[int, int] | None:
     if "width" not in content and "height" not in content:
         return None
-    sides = content.get("width"), content.get("height")
+    sides: list[Any] = [content.get("width"), content.get("height")]
     if not all(type(side) in (int, float) and side > 0 and side == int(side) for side in sides):
         found = " and ".join(map(str, sides))
         raise UserError(f"{where}: width and height must both be whole numbers of pixels, not {found}")

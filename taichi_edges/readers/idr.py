@@ -8,6 +8,8 @@ in the world's frame, and the box is the one around that sphere.
 import zipfile
 import zlib
 from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,12 +18,15 @@ from taichi_edges.readers.companions import mask_folder
 from taichi_edges.readers.frames import Frames, folders_in, matrix
 from taichi_edges.readers.image_files import files_of_views, first_folder, image_files, refuse_missing
 
+if TYPE_CHECKING:
+    from taichi_edges.scene.settings import SourceConfig
+
 CAMERA_FILES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 IMAGE_FOLDERS = ("image", "images", "rgb")
 NO_SKEW = 1e-5  # of the focal length: below, it is the rounding of a matrix stored as float32
 
 
-def read_idr(path, config):
+def read_idr(path: Path, config: "SourceConfig") -> Frames:
     """Frames of an IDR folder, or of one of its camera files. config: the scene's `source` section."""
     where = path if path.is_file() else camera_file(path)
     folder, cameras = where.parent, _read_cameras(where)
@@ -42,12 +47,12 @@ def read_idr(path, config):
     )
 
 
-def camera_file(folder):
+def camera_file(folder: Path) -> Path:
     """The file of cameras in a folder; where there is none, the name that it should have."""
     return next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), folder / CAMERA_FILES[0])
 
 
-def _read_cameras(where):
+def _read_cameras(where: Path) -> dict[str, np.ndarray]:
     """{key: array} of the archive."""
     try:
         with np.load(where) as archive:
@@ -59,7 +64,7 @@ def _read_cameras(where):
         raise UserError(f"{where}: not an .npz archive that can be read ({error}); download it again") from error
 
 
-def _images(folder, given):
+def _images(folder: Path, given: str) -> list[Path]:
     """The images, sorted by name: the i-th belongs to world_mat_i."""
     wanted = folder / given if given else first_folder(folder, IMAGE_FOLDERS)
     images = image_files(wanted)
@@ -69,7 +74,7 @@ def _images(folder, given):
     return images
 
 
-def _check_count(where, cameras, images):
+def _check_count(where: Path, cameras: dict[str, np.ndarray], images: list[Path]) -> None:
     """As many matrices as images: else nobody knows which belong together."""
     count = sum(key.startswith("world_mat_") and not key.startswith("world_mat_inv_") for key in cameras)
     if count == 0:
@@ -79,7 +84,7 @@ def _check_count(where, cameras, images):
         raise UserError(f"{where}: {problem}; the i-th image, by name, goes with world_mat_i: put back what is missing")
 
 
-def _masks(folder, names, config):
+def _masks(folder: Path, names: list[str], config: "SourceConfig") -> list[Path]:
     """The paths of the masks; none where there is no folder of them."""
     masks = mask_folder(folder, config)
     if masks is None or not (config.masks or image_files(masks)):
@@ -89,13 +94,15 @@ def _masks(folder, names, config):
     return paths
 
 
-def _camera(cameras, index, name, where, skipped):
+def _camera(
+    cameras: dict[str, np.ndarray], index: int, name: str, where: Path, skipped: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Intrinsics (3, 3) and camera-to-world (4, 4) of the i-th image; those of a view to skip may be broken."""
     key = f"world_mat_{index}"
     if skipped:
         return np.eye(3), np.eye(4)
     values = cameras.get(key)
-    rows = 3 if np.shape(values) == (3, 4) else 4
+    rows = 3 if values is not None and values.shape == (3, 4) else 4
     projection = matrix(values, (rows, 4), where, f"{key}, of {name},")[:3]
     if not np.isfinite(projection).all():
         raise UserError(f"{where}: {key}, of {name}, is not finite; export it again, or name the view in source.skip")
@@ -104,7 +111,7 @@ def _camera(cameras, index, name, where, skipped):
     return decompose(projection)
 
 
-def decompose(projection):
+def decompose(projection: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Intrinsics (3, 3), K[2, 2] = 1, focal lengths positive, and camera-to-world (4, 4) of a (3, 4) projection.
 
     A projection says the same when it is multiplied by any number; the rotation is a proper one in any case.
@@ -124,7 +131,7 @@ def decompose(projection):
     return intrinsics, pose
 
 
-def _box_of_sphere(cameras, where):
+def _box_of_sphere(cameras: dict[str, np.ndarray], where: Path) -> np.ndarray:
     """(2, 3) corners of the box around what scale_mat_0 makes of the unit sphere, world units."""
     scale = matrix(cameras.get("scale_mat_0"), (4, 4), where, "scale_mat_0")
     reach = np.linalg.norm(scale[:3, :3], axis=1)
@@ -133,5 +140,5 @@ def _box_of_sphere(cameras, where):
     return np.array([scale[:3, 3] - reach, scale[:3, 3] + reach])
 
 
-def _of_any_size(intrinsics, width, height):
+def _of_any_size(intrinsics: np.ndarray, width: int, height: int) -> np.ndarray:
     return intrinsics

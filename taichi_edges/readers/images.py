@@ -1,5 +1,6 @@
 """What the frames' image files hold: ready edge maps, decoded and checked; and which frames have a colour image."""
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -7,14 +8,23 @@ import numpy as np
 
 from taichi_edges.errors import UserError, name_some
 from taichi_edges.files.artefacts import digest_file
-from taichi_edges.readers.frames import LEAVE_OUT, TURNED_BY_EXIF, folders_beside, is_usable, refuse_views, subset
+from taichi_edges.progress import Progress
+from taichi_edges.readers.frames import (
+    LEAVE_OUT,
+    TURNED_BY_EXIF,
+    Frames,
+    folders_beside,
+    is_usable,
+    refuse_views,
+    subset,
+)
 from taichi_edges.views.pictures import is_whole
 
 MASK_KEEPS = 128  # of 255, from here on
 MOSTLY_EDGES = 0.5  # share of edge pixels from which on the maps must be black on white
 
 
-def frames_with_images(frames, progress):
+def frames_with_images(frames: Frames, progress: Progress) -> Frames:
     """The frames whose colour image is there and whole; the others are named in a warning."""
     if not any(frames.image_paths):
         folders = f"{frames.where.parent} has: {folders_beside(frames)}"
@@ -34,15 +44,15 @@ def frames_with_images(frames, progress):
     return subset(frames, [i for i, ok in enumerate(usable) if ok])
 
 
-def refuse_copies(frames, progress):
+def refuse_copies(frames: Frames, progress: Progress) -> None:
     """UserError where all pictures are one and the same file; copies among others are named in a warning."""
     paths = [next((Path(p) for p in pair if is_usable(p)), None) for pair in zip(frames.image_paths, frames.edge_paths)]
-    kinds = {}
+    kinds: dict[str, list[str]] = {}
     for name, path in zip(frames.names, paths, strict=True):
         if path is not None:
             kinds.setdefault(digest_file(path), []).append(name)
     first = next((path for path in paths if path is not None), None)
-    if len(kinds) == 1 and len(frames.names) > 1:
+    if first is not None and len(kinds) == 1 and len(frames.names) > 1:
         if _is_blank(first):
             return  # which is worse, and said by whoever looks for edges
         count = len(frames.names)
@@ -52,21 +62,21 @@ def refuse_copies(frames, progress):
         progress.warn(f"{len(copies)} of {len(frames.names)} pictures are copies of others: {name_some(copies)}")
 
 
-def _is_blank(path):
+def _is_blank(path: Path) -> bool:
     import cv2
 
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    return image is None or (image == image[:1, :1]).all()
+    return image is None or bool((image == image[:1, :1]).all())
 
 
-def name_edgeless(names, counts, progress):
+def name_edgeless(names: Sequence[str], counts: np.ndarray, progress: Progress) -> None:
     """A warning that names the views whose picture shows no edge. counts: (V,) of edge pixels or edgels."""
     empty = [name for name, count in zip(names, counts, strict=True) if not count]
     if empty:
         progress.warn(f"{len(empty)} of {len(names)} pictures show no edge and teach nothing: {name_some(empty)}")
 
 
-def check_sizes(frames, sizes, what):
+def check_sizes(frames: Frames, sizes: Sequence[tuple[int, int]], what: str) -> None:
     """UserError where the (width, height) of some image, `what` it is, is not that of the others or of the file."""
     size = frames.size or max(set(sizes), key=sizes.count)
     wrong = np.array([s != size for s in sizes])
@@ -78,7 +88,7 @@ def check_sizes(frames, sizes, what):
         refuse_views(frames, wrong, f"{problem}; {cure}, {LEAVE_OUT}")
 
 
-def read_edge_maps(frames, progress, threads=None):
+def read_edge_maps(frames: Frames, progress: Progress, threads: int | None = None) -> np.ndarray:
     """(V, H, W) uint8, decoded in parallel; missing, damaged and wrongly sized maps are named."""
     if not any(frames.edge_paths):
         folders = f"{frames.where.parent} has: {folders_beside(frames)}"
@@ -91,17 +101,18 @@ def read_edge_maps(frames, progress, threads=None):
     problem = f"the edge map is missing ({paths[int(missing.argmax())]})"
     refuse_views(frames, missing, f"{problem}; run the detector on it, {LEAVE_OUT}")
     with ThreadPoolExecutor(threads) as pool:
-        maps = list(pool.map(read_grey, paths))
-    broken = np.array([edge_map is None for edge_map in maps])
+        found = list(pool.map(read_grey, paths))
+    broken = np.array([edge_map is None for edge_map in found])
     problem = f"the edge map is truncated or not an 8- or 16-bit image ({paths[int(broken.argmax())]})"
     refuse_views(frames, broken, f"{problem}; write it again, {LEAVE_OUT}")
-    check_sizes(frames, [(edge_map.shape[1], edge_map.shape[0]) for edge_map in maps], "edge map")
-    maps = np.stack(maps)
+    whole = [edge_map for edge_map in found if edge_map is not None]
+    check_sizes(frames, [(edge_map.shape[1], edge_map.shape[0]) for edge_map in whole], "edge map")
+    maps = np.stack(whole)
     _check_edge_shares(frames, maps, progress, paths[0].parent)
     return maps
 
 
-def _check_edge_shares(frames, maps, progress, where):
+def _check_edge_shares(frames: Frames, maps: np.ndarray, progress: Progress, where: Path) -> None:
     """Refuse maps (V, H, W) that cannot be edge maps; name those that are empty. where: their folder."""
     shares = np.array([np.count_nonzero(edge_map >= 128) for edge_map in maps]) / maps[0].size
     empty = shares == 0
@@ -120,7 +131,7 @@ def _check_edge_shares(frames, maps, progress, where):
         progress.warn(f"{len(names)} of {len(maps)} edge maps have no edge pixel and teach nothing: {name_some(names)}")
 
 
-def read_grey(path):
+def read_grey(path: Path) -> np.ndarray | None:
     """(H, W) uint8 of an image file: one channel, or the brightest of three; None where it is damaged.
 
     16-bit maps are brought to 8 bits.
@@ -139,7 +150,7 @@ def read_grey(path):
     return image if image.ndim == 2 else np.ascontiguousarray(image[:, :, :3].max(axis=2))
 
 
-def read_mask(path, size=None):
+def read_mask(path: Path | str, size: tuple[int, int] | None = None) -> np.ndarray:
     """(H, W) uint8, 1 where a mask keeps. size: (width, height) px of the view, to which the mask is brought."""
     import cv2
 

@@ -4,8 +4,10 @@ Intrinsics are per frame (`camera_intrinsics`, 3x3, pixel centres at integers) o
 horizontal field of view in radians; then the principal point is the image's centre, (size - 1) / 2.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,8 +15,11 @@ from taichi_edges.errors import UserError
 from taichi_edges.readers.companions import mask_folder, mask_paths
 from taichi_edges.readers.frames import Frames, matrix, read_json
 
+if TYPE_CHECKING:
+    from taichi_edges.scene.settings import SourceConfig
 
-def read_nerf(path, config):
+
+def read_nerf(path: Path, config: "SourceConfig") -> Frames:
     """Frames of a NEF folder, or of one of its files. config: the scene's `source` section."""
     where = path if path.is_file() else path / f"transforms_{config.split}.json"
     folder = where.parent
@@ -41,19 +46,19 @@ def read_nerf(path, config):
     )
 
 
-def _masks(folder, config, paths):
+def _masks(folder: Path, config: "SourceConfig", paths: list[Path]) -> tuple[Sequence[Path | str], tuple[str, ...]]:
     """As `mask_paths`: masks at the images' own paths below their folder, or all of them beside each other in it."""
     masks = mask_folder(folder, config)
     nested = masks is not None and any((masks / path.parent).is_dir() for path in paths)
     return mask_paths(folder, config, [str(path) if nested else path.name for path in paths])
 
 
-def _image(folder, config, path):
+def _image(folder: Path, config: "SourceConfig", path: Path) -> Path | str:
     """Path of the colour image that belongs to a frame's file; '' where the scene names no folder of them."""
     return folder / config.images / path.name if config.images else ""
 
 
-def _is_colour(path):
+def _is_colour(path: Path) -> bool:
     """Whether there is an image at `path` with transparency, or with channels that differ."""
     import cv2
 
@@ -63,7 +68,7 @@ def _is_colour(path):
     return image.shape[2] == 4 or bool((image != image[:, :, :1]).any())
 
 
-def _file_path(frame, where):
+def _file_path(frame: Any, where: Path) -> Path:
     """Relative path of the frame's image; the layout leaves the suffix out."""
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
         raise UserError(f"{where}: a frame without file_path; every frame names its image")
@@ -73,7 +78,9 @@ def _file_path(frame, where):
     return path if path.suffix.lower() in (".png", ".jpg", ".jpeg") else path.with_name(path.name + ".png")
 
 
-def _intrinsics(frame, content, name, where, width, height):
+def _intrinsics(
+    frame: dict[str, Any], content: dict[str, Any], name: str, where: Path, width: int, height: int
+) -> np.ndarray:
     """(3, 3): the frame's own, or those that the field of view means for an image of this size."""
     if "camera_intrinsics" in frame:
         return matrix(frame["camera_intrinsics"], (3, 3), where, f"camera_intrinsics of {name}")

@@ -6,7 +6,9 @@ poses, points (`ply_file_path`), box and everything exported are in the frame of
 """
 
 import os
-from pathlib import PurePosixPath
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,13 +21,16 @@ from taichi_edges.readers.scene_box import box_of_cameras, scene_box
 from taichi_edges.views.cameras import OPENGL_TO_OPENCV
 from taichi_edges.views.picture_sizes import picture_size
 
+if TYPE_CHECKING:
+    from taichi_edges.scene.settings import SourceConfig
+
 LISTING = "transforms.json"
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4")  # the first four as in COLMAP's OPENCV
 
 
-def read_nerfstudio(path, config):
+def read_nerfstudio(path: Path, config: "SourceConfig") -> Frames:
     """Frames of a nerfstudio or instant-ngp folder, or of a file like its transforms.json.
 
     config: the scene's `source` section.
@@ -47,7 +52,7 @@ def read_nerfstudio(path, config):
     return Frames(
         where=where,
         names=_view_names(inner),
-        edge_paths=edge_paths(folder / config.edges, inner) if config.edges else [""] * len(inner),
+        edge_paths=edge_paths(folder, config, inner),
         image_paths=images,
         intrinsics=[None] * len(inner),
         camera_to_world=poses,
@@ -61,7 +66,7 @@ def read_nerfstudio(path, config):
     )
 
 
-def _file_path(frame, where):
+def _file_path(frame: Any, where: Path) -> PurePosixPath:
     """The image of a frame, relative to the file's folder or absolute."""
     name = frame.get("file_path") if isinstance(frame, dict) else None
     if not isinstance(name, str) or not PurePosixPath(name).name:
@@ -69,19 +74,19 @@ def _file_path(frame, where):
     return PurePosixPath(os.path.normpath(name.replace("\\", "/")))
 
 
-def _below_their_folder(paths):
+def _below_their_folder(paths: list[PurePosixPath]) -> list[str]:
     """(V,) the paths below the folder that all of them share, as edge maps and masks are named."""
     shared = os.path.commonpath([path.parent for path in paths]) if len({p.is_absolute() for p in paths}) == 1 else ""
     return [str(path.relative_to(shared)) if shared else str(path) for path in paths]
 
 
-def _view_names(inner):
+def _view_names(inner: list[str]) -> list[str]:
     """Names without suffixes, unless two would be the same."""
     stems = [str(PurePosixPath(name).with_suffix("")) for name in inner]
     return stems if len(set(stems)) == len(stems) else list(inner)
 
 
-def _image(folder, given, path, inner):
+def _image(folder: Path, given: str, path: PurePosixPath, inner: str) -> Path:
     """Where the image of a frame is: what the file says, whatever its suffix, or that name in `source.images`."""
     wanted = folder / given / inner if given else folder / path
     if wanted.is_file():
@@ -89,7 +94,9 @@ def _image(folder, given, path, inner):
     return companion(wanted.parent, wanted.name) or companion(wanted.parent, f"{wanted.name}.png") or wanted
 
 
-def _masks(folder, config, listed, inner):
+def _masks(
+    folder: Path, config: "SourceConfig", listed: list[dict[str, Any]], inner: list[str]
+) -> tuple[Sequence[Path | str], tuple[str, ...]]:
     """(V,) masks, '' where a view has none, and warnings; those the file names, unless the scene names others."""
     named = [frame.get("mask_path") for frame in listed]
     if config.masks or not any(named):
@@ -97,18 +104,23 @@ def _masks(folder, config, listed, inner):
     return [folder / name if isinstance(name, str) and name else "" for name in named], ()
 
 
-def _lens(values, image, where):
+def _lens(values: dict[str, Any], image: Path, where: Path) -> Lens:
     """The Lens of a frame, whose own values go before those of the file."""
     name = values["file_path"]
     width, height = _size(values, image, where, name)
     focal_x = _number(values, "fl_x", where, name) or _focal(values, "camera_angle_x", width, where, name)
     focal_y = _number(values, "fl_y", where, name) or _focal(values, "camera_angle_y", height, where, name)
     focal_x, focal_y = focal_x or focal_y, focal_y or focal_x
-    if not focal_x:
+    if not focal_x or not focal_y:
         raise UserError(f"{where}: {name} has neither fl_x nor camera_angle_x; add one of them, to the frame or on top")
-    centre = [_number(values, key, where, name, side / 2) for key, side in (("cx", width), ("cy", height))]
-    k1, k2, p1, p2, k3, k4 = (_number(values, key, where, name, 0.0) for key in DISTORTION)
-    pinhole = (focal_x, focal_y, *centre)
+    centre_x, centre_y = _number(values, "cx", where, name), _number(values, "cy", where, name)
+    k1, k2, p1, p2, k3, k4 = (_number(values, key, where, name) or 0.0 for key in DISTORTION)
+    pinhole = (
+        focal_x,
+        focal_y,
+        width / 2 if centre_x is None else centre_x,
+        height / 2 if centre_y is None else centre_y,
+    )
     if _is_fisheye(values, where):
         return Lens("OPENCV_FISHEYE", width, height, (*pinhole, k1, k2, k3, k4))
     if k4:
@@ -121,7 +133,7 @@ def _lens(values, image, where):
     return Lens("PINHOLE", width, height, pinhole)
 
 
-def _is_fisheye(values, where):
+def _is_fisheye(values: dict[str, Any], where: Path) -> bool:
     """instant-ngp says so by a key of its own."""
     model = str(values.get("camera_model") or "OPENCV").upper()
     if model not in (*PERSPECTIVE, *FISHEYE):
@@ -130,16 +142,17 @@ def _is_fisheye(values, where):
     return model in FISHEYE or values.get("is_fisheye") is True
 
 
-def _number(values, key, where, name, default=None):
+def _number(values: dict[str, Any], key: str, where: Path, name: str) -> float | None:
+    """The value of a key, None without; UserError where it is no finite number."""
     value = values.get(key)
     if value is None:
-        return default
+        return None
     if type(value) not in (int, float) or not np.isfinite(value):
         raise UserError(f"{where}: {key} of {name} must be a finite number, not {value!r}")
     return float(value)
 
 
-def _focal(values, key, side, where, name):
+def _focal(values: dict[str, Any], key: str, side: int, where: Path, name: str) -> float | None:
     """Pixels, from a field of view in radians across `side` pixels; None where the file has none."""
     angle = _number(values, key, where, name)
     if angle is None:
@@ -149,22 +162,20 @@ def _focal(values, key, side, where, name):
     return 0.5 * side / np.tan(0.5 * angle)
 
 
-def _size(values, image, where, name):
+def _size(values: dict[str, Any], image: Path, where: Path, name: str) -> tuple[int, int]:
     """(width, height) in pixels as the file says, else of the image."""
-    sides = [_number(values, key, where, name) for key in ("w", "h")]
-    if None in sides:
+    width, height = _number(values, "w", where, name), _number(values, "h", where, name)
+    if width is None or height is None:
         size = picture_size(image) if image.is_file() else None
         if size is None:
             raise UserError(f"{where}: neither w and h nor the image tell how large {name} is; add w and h")
         return size
-    if not all(side > 0 and side == int(side) for side in sides):
-        raise UserError(
-            f"{where}: w and h of {name} must be whole numbers of pixels, not {sides[0]:g} and {sides[1]:g}"
-        )
-    return int(sides[0]), int(sides[1])
+    if not all(side > 0 and side == int(side) for side in (width, height)):
+        raise UserError(f"{where}: w and h of {name} must be whole numbers of pixels, not {width:g} and {height:g}")
+    return int(width), int(height)
 
 
-def _points(folder, content, where):
+def _points(folder: Path, content: dict[str, Any], where: Path) -> tuple[np.ndarray | None, tuple[Path, ...]]:
     """(n, 3) the points of the file's PLY, None without, and the files read."""
     name = content.get("ply_file_path")
     if not isinstance(name, str) or not name:
@@ -175,16 +186,21 @@ def _points(folder, content, where):
     return read_cloud(path, "ply_file_path"), (path,)
 
 
-def _box(points, poses, lenses, config):
+def _box(
+    points: np.ndarray | None, poses: list[Any], lenses: list[Lens], config: "SourceConfig"
+) -> tuple[np.ndarray | None, tuple[str, ...]]:
     """(2, 3) corners of the scene, None where nothing tells; and doubts."""
     try:
-        poses = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
+        camera_to_world = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
     except (TypeError, ValueError):
         return None, ()  # a pose is broken, which is said later, by name
-    poses = poses @ OPENGL_TO_OPENCV if config.axes != "opencv" else poses
+    if config.axes != "opencv":
+        camera_to_world = camera_to_world @ OPENGL_TO_OPENCV
     if points is not None:
-        return scene_box(points, poses), ()
-    box = box_of_cameras(poses, [min(lens.width / lens.params[0], lens.height / lens.params[1]) for lens in lenses])
+        return scene_box(points, camera_to_world), ()
+    box = box_of_cameras(
+        camera_to_world, [min(lens.width / lens.params[0], lens.height / lens.params[1]) for lens in lenses]
+    )
     if box is None:
         return None, ("no points, and the cameras do not look at one place: nothing tells where the scene is; set box",)
     return box, (

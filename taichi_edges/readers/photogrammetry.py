@@ -5,14 +5,21 @@ COLMAP puts the centre of the top-left pixel at (0.5, 0.5); what leaves this mod
 
 import functools
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np  # before pycolmap, always: the other way round the process dies later, 'free(): invalid pointer'
 
 from taichi_edges.errors import UserError, did_you_mean
 from taichi_edges.files.artefacts import file_state
+from taichi_edges.progress import Progress
+
+if TYPE_CHECKING:
+    import pycolmap
 
 HALF_PIXEL = 0.5  # between COLMAP's pixel coordinates and ours
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")  # the last two from COLMAP 3.12 on
@@ -26,7 +33,7 @@ PAIRS_AT_ONCE = 40  # matched between two reports
 MODEL_SUFFIXES = (".bin", ".txt")  # in the order in which COLMAP looks for them
 
 
-def _colmap():
+def _colmap() -> ModuleType:
     """pycolmap, silent: what it would log comes as an exception as well, or is no concern of the user's."""
     import pycolmap
 
@@ -34,7 +41,7 @@ def _colmap():
     return pycolmap
 
 
-def colmap_version():
+def colmap_version() -> str:
     """Of pycolmap: what COLMAP has computed belongs to it."""
     return version("pycolmap")
 
@@ -49,9 +56,9 @@ class Lens:
     model: str
     width: int
     height: int
-    params: tuple
+    params: tuple[float, ...]
 
-    def camera(self):
+    def camera(self) -> "pycolmap.Camera":
         """The pycolmap Camera; UserError where there is no such model, or it has other parameters."""
         pycolmap = _colmap()
         names = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
@@ -68,7 +75,7 @@ class Lens:
         return camera
 
     @property
-    def is_pinhole(self):
+    def is_pinhole(self) -> bool:
         """Whether its pictures are those of a pinhole camera as they are."""
         camera = self.camera()
         return camera.is_undistorted() and not camera.is_perspective_fisheye()
@@ -78,19 +85,19 @@ class Lens:
 class Reconstruction:
     """A model of structure from motion, in its own frame.
 
-    names: (V,) of the registered images. lenses: (V,) Lens. camera_to_world: (V, 4, 4), OpenCV axes.
+    names: (V,) of the registered images. lenses: (V,). camera_to_world: (V, 4, 4), OpenCV axes.
     points: (n, 3). errors: (n,) mean reprojection error, px. track_lengths: (n,) images that see each point.
     """
 
-    names: list
-    lenses: list
+    names: list[str]
+    lenses: list[Lens]
     camera_to_world: np.ndarray
     points: np.ndarray
     errors: np.ndarray
     track_lengths: np.ndarray
 
 
-def model_files(folder):
+def model_files(folder: Path) -> list[Path]:
     """The files of the COLMAP model in a folder, [] where there is none. UserError where it is there in part."""
     for suffix in MODEL_SUFFIXES:
         found = [folder / f"{name}{suffix}" for name in MODEL_FILES if (folder / f"{name}{suffix}").is_file()]
@@ -102,13 +109,13 @@ def model_files(folder):
     return []
 
 
-def read_reconstruction(folder):
+def read_reconstruction(folder: Path) -> Reconstruction:
     """The Reconstruction of a folder with `model_files`; read once, as long as the files stay the same."""
-    return _reconstruction_of(Path(folder), tuple(file_state(path) for path in model_files(folder)))
+    return _reconstruction_of(folder, tuple(file_state(path) for path in model_files(folder)))
 
 
 @functools.lru_cache(maxsize=8)
-def _reconstruction_of(folder, _states):
+def _reconstruction_of(folder: Path, _states: tuple[tuple[int, ...], ...]) -> Reconstruction:
     pycolmap = _colmap()
     try:
         model = pycolmap.Reconstruction(str(folder))
@@ -119,14 +126,14 @@ def _reconstruction_of(folder, _states):
         raise UserError(f"{folder}: not a COLMAP model that can be read ({reason}); export or copy it again") from error
 
 
-def _refuse_cut_cameras(path, model):
+def _refuse_cut_cameras(path: Path, model: "pycolmap.Reconstruction") -> None:
     """ValueError where a binary file of cameras ends early, the one that pycolmap does not notice."""
     whole = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
     if path.is_file() and path.stat().st_size < whole:
         raise ValueError(f"{path.name} is truncated")
 
 
-def as_reconstruction(model):
+def as_reconstruction(model: "pycolmap.Reconstruction") -> Reconstruction:
     """The Reconstruction of a pycolmap Reconstruction."""
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     lenses = {number: _lens(camera) for number, camera in model.cameras.items()}
@@ -141,15 +148,15 @@ def as_reconstruction(model):
     )
 
 
-def _lens(camera):
+def _lens(camera: "pycolmap.Camera") -> Lens:
     return Lens(camera.model.name, camera.width, camera.height, tuple(float(value) for value in camera.params))
 
 
-def _camera_to_world(image):
+def _camera_to_world(image: "pycolmap.Image") -> np.ndarray:
     return np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
 
 
-def undistorted(lens):
+def undistorted(lens: Lens) -> tuple[np.ndarray, tuple[int, int]]:
     """The pinhole camera, without distortion, that shows what the lens shows: intrinsics (3, 3) and (width, height).
 
     As large as the lens's picture or a little smaller, so that (nearly) no pixel of it is empty. Pixel centres at
@@ -164,12 +171,22 @@ def undistorted(lens):
     return intrinsics, (camera.width, camera.height)
 
 
-def distorted_pixels(lens, rays):
+def distorted_pixels(lens: Lens, rays: np.ndarray) -> np.ndarray:
     """(n, 2) pixels, centres at integers, at which a lens shows (n, 3) camera directions; NaN where it cannot."""
-    return lens.camera().img_from_cam(np.ascontiguousarray(rays, dtype=np.float64)) - HALF_PIXEL
+    pixels = lens.camera().img_from_cam(np.ascontiguousarray(rays, dtype=np.float64))
+    return np.asarray(pixels) - HALF_PIXEL
 
 
-def reconstruct(images, names, groups, folder, seed, threads, progress, masks=None):
+def reconstruct(
+    images: Path,
+    names: Sequence[str],
+    groups: Sequence[list[str]],
+    folder: Path,
+    seed: int,
+    threads: int,
+    progress: Progress,
+    masks: Path | None = None,
+) -> list[str]:
     """Structure from motion on the CPU; the COLMAP model with the most images is written to `folder`/sparse.
 
     images: the folder of the images. names: (V,) relative paths. groups: lists of names that share a camera.
@@ -199,7 +216,15 @@ def reconstruct(images, names, groups, folder, seed, threads, progress, masks=No
     return sorted(image.name for image in model.images.values() if image.has_pose)
 
 
-def _extract(database, images, names, groups, masks, threads, progress):
+def _extract(
+    database: Path,
+    images: Path,
+    names: Sequence[str],
+    groups: Sequence[list[str]],
+    masks: Path | None,
+    threads: int,
+    progress: Progress,
+) -> None:
     """Cameras, in the order of the groups, then features, some images at a time."""
     pycolmap = _colmap()
     pycolmap.Database.open(str(database)).close()
@@ -216,7 +241,7 @@ def _extract(database, images, names, groups, masks, threads, progress):
             report(min(start + threads, len(names)))
 
 
-def _numbered(database):
+def _numbered(database: Path) -> dict[str, str]:
     """Give the images of a database numbers for names: a list of pairs knows no blanks. Returns {name: number}."""
     numbers = {}
     with _colmap().Database.open(str(database)) as opened:
@@ -227,7 +252,7 @@ def _numbered(database):
     return numbers
 
 
-def _match(database, listing, names, seed, threads, progress):
+def _match(database: Path, listing: Path, names: Sequence[str], seed: int, threads: int, progress: Progress) -> None:
     """Features of pairs of images, some pairs at a time."""
     pycolmap = _colmap()
     pairs = image_pairs(names)
@@ -244,16 +269,18 @@ def _match(database, listing, names, seed, threads, progress):
     listing.unlink()
 
 
-def image_pairs(names):
+def image_pairs(names: Sequence[str]) -> list[tuple[str, str]]:
     """The pairs to match: all of up to LAST_PAIRED images; of more, each with those that follow, near and far."""
     count = len(names)
-    steps = range(1, count)
+    steps: Sequence[int] = range(1, count)
     if count > LAST_PAIRED:
         steps = sorted({*range(1, NEIGHBOURS + 1), *(1 << power for power in range(count.bit_length()))})
     return [(names[i], names[i + step]) for i in range(count) for step in steps if i + step < count]
 
 
-def _map(database, images, folder, count, seed, progress):
+def _map(
+    database: Path, images: Path, folder: Path, count: int, seed: int, progress: Progress
+) -> "pycolmap.Reconstruction | None":
     """The pycolmap Reconstruction with the most images, None without one."""
     pycolmap = _colmap()
     pycolmap.set_random_seed(seed)
@@ -269,7 +296,7 @@ def _map(database, images, folder, count, seed, progress):
     folder.mkdir(exist_ok=True)
     done = [0]
 
-    def another(registered):
+    def another(registered: int) -> None:
         done[0] = min(done[0] + registered, count)
         report(done[0], f"{done[0]} images placed")
 
@@ -280,7 +307,7 @@ def _map(database, images, folder, count, seed, progress):
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
 
 
-def known_focal_length(path):
+def known_focal_length(path: Path) -> float | None:
     """Focal length in pixels that an image's EXIF tells, None where it tells none. UserError: not an image."""
     try:
         camera = _colmap().infer_camera_from_image(str(path))

@@ -4,17 +4,22 @@ import json
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from taichi_edges.errors import UserError, name_some
 from taichi_edges.files.artefacts import digest, digest_file, write_json
+from taichi_edges.progress import Progress
 from taichi_edges.readers.colmap import frames_of_model
 from taichi_edges.readers.companions import edge_paths, is_picture, mask_folder, mask_paths
 from taichi_edges.readers.frames import Frames, is_usable
 from taichi_edges.readers.images import read_mask
 from taichi_edges.readers.photogrammetry import colmap_version, known_focal_length, model_files, reconstruct
 from taichi_edges.views.picture_sizes import picture_size
+
+if TYPE_CHECKING:
+    from taichi_edges.scene.settings import SourceConfig
 
 METHOD = 1  # raised when the same photographs give another reconstruction
 FEWEST = 3  # views; fewer show no edge surely
@@ -25,7 +30,7 @@ ADVICE = (
 )
 
 
-def read_photos(folder, config):
+def read_photos(folder: Path, config: "SourceConfig") -> Frames:
     """Frames of all photographs below a folder, still without poses. config: the scene's `source` section."""
     images = folder / config.images if config.images else folder
     names = [path.relative_to(images).as_posix() for path in _photos(images, folder, config)]
@@ -37,7 +42,7 @@ def read_photos(folder, config):
     return Frames(
         where=images,
         names=stems if len(set(stems)) == len(stems) else names,
-        edge_paths=edge_paths(folder / config.edges, names) if config.edges else [""] * len(names),
+        edge_paths=edge_paths(folder, config, names),
         image_paths=[images / name for name in names],
         intrinsics=[None] * len(names),
         camera_to_world=[None] * len(names),
@@ -46,7 +51,7 @@ def read_photos(folder, config):
     )
 
 
-def _photos(images, folder, config):
+def _photos(images: Path, folder: Path, config: "SourceConfig") -> list[Path]:
     """The photographs below a folder, in order; not masks, edge maps and what is hidden."""
     if not images.is_dir():
         raise UserError(f"{images}: no such folder; set source.path to the folder of the photographs")
@@ -61,7 +66,9 @@ def _photos(images, folder, config):
     )
 
 
-def posed_photos(frames, folder, config, cache, seed, threads, progress):
+def posed_photos(
+    frames: Frames, folder: Path, config: "SourceConfig", cache: Path, seed: int, threads: int, progress: Progress
+) -> Frames:
     """The Frames of `read_photos` with poses, from structure from motion that is done once and kept in `cache`.
 
     folder: of edge maps and masks. config: the scene's `source` section.
@@ -87,7 +94,15 @@ def posed_photos(frames, folder, config, cache, seed, threads, progress):
     return found
 
 
-def _solved(images, names, masks, cache, seed, threads, progress):
+def _solved(
+    images: Path,
+    names: list[str],
+    masks: dict[str, Path | str],
+    cache: Path,
+    seed: int,
+    threads: int,
+    progress: Progress,
+) -> dict[str, Any]:
     """Structure from motion, its model in `cache`: what is recorded of it.
 
     registered, unreadable: names of photographs. files: {name: digest} of the model's.
@@ -106,28 +121,28 @@ def _solved(images, names, masks, cache, seed, threads, progress):
     }
 
 
-def _refuse_few(images, names):
+def _refuse_few(images: Path, names: list[str]) -> None:
     if len(names) < FEWEST:
         raise UserError(f"{images}: {len(names)} photographs are too few to find where they were taken; {ADVICE}")
 
 
-def _named_masks(masks, folder):
+def _named_masks(masks: dict[str, Path | str], folder: Path) -> Path:
     """The masks, {name of the photograph: path}, in a folder where COLMAP finds them: PNG files `<name>.png`."""
     import cv2
 
     for name, path in masks.items():
         target = folder / f"{name}.png"
         target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(cv2.imencode(".png", np.uint8(255) * read_mask(path))[1])
+        target.write_bytes(cv2.imencode(".png", np.uint8(255) * read_mask(path))[1].tobytes())
     return folder
 
 
-def _names(frames):
+def _names(frames: Frames) -> list[str]:
     """(V,) paths of the photographs, relative to their folder."""
     return [Path(path).relative_to(frames.where).as_posix() for path in frames.image_paths]
 
 
-def _whole(frames, progress):
+def _whole(frames: Frames, progress: Progress) -> list[str]:
     """Names of the photographs that are whole; the others are named in a warning."""
     names = _names(frames)
     whole = [name for name, path in zip(names, frames.image_paths, strict=True) if is_usable(path)]
@@ -137,7 +152,7 @@ def _whole(frames, progress):
     return whole
 
 
-def _known(record, key, cache):
+def _known(record: Path, key: str, cache: Path) -> dict[str, Any] | None:
     """What `_solved` gave for the same photographs; None where it did not, or its model is not as it was written."""
     try:
         content = json.loads(record.read_text(encoding="utf-8"))
@@ -148,15 +163,15 @@ def _known(record, key, cache):
     return content if same else None
 
 
-def _digests(folder):
+def _digests(folder: Path) -> dict[str, str]:
     """{name: digest} of the files of the COLMAP model in a folder."""
     return {path.name: digest_file(path) for path in model_files(folder)}
 
 
-def _by_camera(images, names, threads):
+def _by_camera(images: Path, names: list[str], threads: int) -> list[list[str]]:
     """Lists of names that share a camera: of one folder, one size, one focal length; without what is no image."""
 
-    def kind(name):
+    def kind(name: str) -> tuple[str, tuple[int, int] | None, float | None] | None:
         try:
             focal = known_focal_length(images / name)
         except UserError:
@@ -169,7 +184,7 @@ def _by_camera(images, names, threads):
     return [[name for name, other in zip(names, kinds, strict=True) if other == each] for each in different]
 
 
-def _check_registered(images, names, registered, progress):
+def _check_registered(images: Path, names: list[str], registered: list[str], progress: Progress) -> None:
     """UserError or a warning where too few photographs found their place, with what to do about it."""
     lost = [name for name in names if name not in set(registered)]
     found = f"{len(registered)} of {len(names)} photographs were found to show the same scene"

@@ -5,11 +5,16 @@ thousand times larger or smaller), and what then fits is said.
 """
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from taichi_edges.errors import UserError, name_some
 from taichi_edges.views.cameras import OPENGL_TO_OPENCV, Similarity, inside_image, invert_pose, project
+
+if TYPE_CHECKING:
+    from taichi_edges.readers.frames import Frames
 
 LEAST_VIEWS = 3  # two viewing planes always meet: only a third tells an edge from chance
 BOX_GRIDS = (9, 33)  # points along each side of the scene box that are looked for in every view; if in vain, more
@@ -34,18 +39,18 @@ class CamerasAsRead:
     sizes: np.ndarray
     opengl: bool
 
-    def flipped(self):
+    def flipped(self) -> "CamerasAsRead":
         """As if the file had the other axes."""
         return replace(self, poses=self.poses @ OPENGL_TO_OPENCV)
 
-    def inverted(self):
+    def inverted(self) -> "CamerasAsRead":
         """As if the file had world-to-camera."""
         of_file = self.poses @ OPENGL_TO_OPENCV if self.opengl else self.poses
         inverted = np.tile(np.eye(4), (len(of_file), 1, 1))
         inverted[:, :3] = invert_pose(of_file)
         return replace(self, poses=inverted @ OPENGL_TO_OPENCV if self.opengl else inverted)
 
-    def see(self, points, similarity):
+    def see(self, points: np.ndarray, similarity: Similarity) -> np.ndarray:
         """(V, n) bool: which views have which of the (n, 3) points in front of them and inside the image.
 
         In the unit cube of the similarity: what is too near for a camera does not depend on the units of the input.
@@ -56,7 +61,7 @@ class CamerasAsRead:
         return np.array([inside_image(project(points, lens, pose)[0], *size) for lens, pose, size in views])
 
 
-def into_unit_cube(world_to_camera, similarity):
+def into_unit_cube(world_to_camera: np.ndarray, similarity: Similarity) -> np.ndarray:
     """The same cameras for a world that went through the similarity: camera units become unit-cube units too."""
     moved = world_to_camera.copy()
     rotations, translations = world_to_camera[:, :, :3], world_to_camera[:, :, 3]
@@ -64,7 +69,7 @@ def into_unit_cube(world_to_camera, similarity):
     return moved
 
 
-def check_views(frames):
+def check_views(frames: "Frames") -> None:
     """UserError where there are too few views."""
     count = len(frames.names)
     if count < LEAST_VIEWS:
@@ -73,7 +78,7 @@ def check_views(frames):
         raise UserError(f"{frames.where}: {problem}: {cure}")
 
 
-def check_places(frames, poses):
+def check_places(frames: "Frames", poses: np.ndarray) -> None:
     """UserError where the cameras, (V, 4, 4), all stand in one place: nothing has depth then."""
     centres = poses[:, :3, 3]
     if np.ptp(centres, axis=0).max() > SAME_PLACE * max(np.abs(centres).max(), np.finfo(float).tiny):
@@ -85,7 +90,7 @@ def check_places(frames, poses):
     raise UserError(f"{frames.where}: {problem}, and nothing tells depth; move between pictures, or export poses again")
 
 
-def check_points(frames, cameras):
+def check_points(frames: "Frames", cameras: CamerasAsRead) -> None:
     """UserError where the points of the layout, if there are any, are not what the cameras see."""
     if frames.points is None or len(frames.points) < LEAST_VIEWS:
         return
@@ -100,17 +105,17 @@ def check_points(frames, cameras):
         **{f"the points seem to be {_times(1 / factor)}": (cameras, factor * points) for factor in UNITS},
     }
     shares = {cure: seen for cure, trial in trials.items() for seen, wrong in [_share_seen(*trial)] if wrong is None}
-    cure = max(shares, key=shares.get, default=None)
+    cure = max(shares, key=lambda each: shares[each], default=None)
     if cure is None or shares[cure] < max(ENOUGH_SEEN, 2 * share * (trouble is None)):
         cure = "poses, intrinsics or points are not of these images, or the points are in a frame of their own"
     seen = f"{100 * share:.0f} % of the {len(frames.points)} points are in the images of {LEAST_VIEWS} views"
     raise UserError(f"{frames.where}: {trouble.format('box of the points') if trouble else f'only {seen}'}: {cure}")
 
 
-def check_box(frames, cameras, box):
+def check_box(frames: "Frames", cameras: CamerasAsRead, box: np.ndarray) -> None:
     """UserError where the scene box, (2, 3) corners in input units, is not what the views show."""
     seen = _seen_of_box(cameras, box)
-    seeing, most = seen.any(axis=1), int(seen.sum(axis=0).max())
+    seeing, most = np.any(seen, axis=1), int(seen.sum(axis=0).max())
     corners = " to ".join("(" + ", ".join(f"{x:g}" for x in corner) + ")" for corner in box)
     if not seeing.any():
         cure = _what_helps(cameras, box, 0) or _where_they_are(cameras)
@@ -127,12 +132,12 @@ def check_box(frames, cameras, box):
         raise UserError(f"{frames.where}: {which}: the scene box {corners} is not in sight; {cure}")
 
 
-def views_in_sight(cameras, box):
+def views_in_sight(cameras: CamerasAsRead, box: ArrayLike) -> np.ndarray:
     """(V,) bool: which views have some of the (2, 3) box in front of them and inside the image."""
-    return _seen_of_box(cameras, np.asarray(box, dtype=np.float64)).any(axis=1)
+    return np.any(_seen_of_box(cameras, np.asarray(box, dtype=np.float64)), axis=1)
 
 
-def _share_seen(cameras, points):
+def _share_seen(cameras: CamerasAsRead, points: np.ndarray) -> tuple[float, str | None]:
     """The share of the points that are in the images of enough views, and what is wrong with their scale, or None."""
     low, high = np.quantile(points, [0.05, 0.95], axis=0)
     box = np.array([low, np.maximum(high, low + np.finfo(float).eps * max(np.abs(points).max(), 1e-300))])
@@ -140,7 +145,7 @@ def _share_seen(cameras, points):
     return float((seen.sum(axis=0) >= LEAST_VIEWS).mean()), _scale_trouble(cameras, box)
 
 
-def _seen_of_box(cameras, box):
+def _seen_of_box(cameras: CamerasAsRead, box: np.ndarray) -> np.ndarray:
     """(V, n) bool: which views see which points of a grid through the (2, 3) box."""
     for count in BOX_GRIDS:
         axes = [np.linspace(low, high, count) for low, high in zip(*box, strict=True)]
@@ -151,18 +156,18 @@ def _seen_of_box(cameras, box):
     return seen
 
 
-def _axes(cameras):
+def _axes(cameras: CamerasAsRead) -> tuple[str, str]:
     return ("OpenGL", "opencv") if cameras.opengl else ("OpenCV", "opengl")
 
 
-def _times(factor):
+def _times(factor: float) -> str:
     """'1000 times too large, in millimetres where the poses are in metres?'."""
     if factor > 1:
         return f"{factor:g} times too large, in millimetres where the poses are in metres?"
     return f"{1 / factor:g} times too small, in metres where the poses are in millimetres?"
 
 
-def _what_helps(cameras, box, seeing):
+def _what_helps(cameras: CamerasAsRead, box: np.ndarray, seeing: int) -> str | None:
     """What makes more than `seeing` views see the box, and most of all views; None where nothing does.
 
     A few that look its way are chance: cameras all around something always have some that do.
@@ -177,23 +182,23 @@ def _what_helps(cameras, box, seeing):
         cure: _seen_of_box(trial, moved).any(axis=1).sum() if _scale_trouble(trial, moved) is None else 0
         for cure, (trial, moved) in trials.items()
     }
-    cure = max(counts, key=counts.get)
+    cure = max(counts, key=lambda each: counts[each])
     return cure if counts[cure] > seeing and counts[cure] >= MOST_VIEWS * len(cameras.poses) else None
 
 
-def _where_they_are(cameras):
+def _where_they_are(cameras: CamerasAsRead) -> str:
     centre = "(" + ", ".join(f"{x:.3g}" for x in cameras.poses[:, :3, 3].mean(axis=0)) + ")"
     return f"correct the box (the cameras are around {centre}) or source.axes, now {_axes(cameras)[0]}"
 
 
-def _check_scale(frames, cameras, box):
+def _check_scale(frames: "Frames", cameras: CamerasAsRead, box: np.ndarray) -> None:
     trouble = _scale_trouble(cameras, box)
     if trouble:
         where = f"{frames.where}: {trouble.format('scene box')}"
         raise UserError(f"{where}: is it in other units (metres, millimetres)? Correct box, or export the poses again")
 
 
-def _scale_trouble(cameras, box):
+def _scale_trouble(cameras: CamerasAsRead, box: np.ndarray) -> str | None:
     """What is wrong where a box, {} in the text, is far too large or small for the cameras; None where it is not."""
     side = float((box[1] - box[0]).max())
     spread = float(np.linalg.norm(np.ptp(cameras.poses[:, :3, 3], axis=0)))

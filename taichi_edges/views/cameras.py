@@ -11,6 +11,7 @@ Quaternions    (w, x, y, z).
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 # Near planes, all there are, in unit-cube units.
 NEAR = 0.01  # what is nearer counts as behind the camera
@@ -28,25 +29,25 @@ class Similarity:
     """
 
     scale: float = 1.0
-    offset: tuple = (0.0, 0.0, 0.0)
+    offset: tuple[float, ...] = (0.0, 0.0, 0.0)
 
-    def to_unit(self, points):
+    def to_unit(self, points: ArrayLike) -> np.ndarray:
         """(..., 3) points of the input frame -> the unit cube."""
         return np.asarray(points) * self.scale + np.asarray(self.offset)
 
-    def to_input(self, points):
+    def to_input(self, points: ArrayLike) -> np.ndarray:
         """(..., 3) points of the unit cube -> the input frame."""
         return (np.asarray(points) - np.asarray(self.offset)) / self.scale
 
     @staticmethod
-    def of_box(box):
+    def of_box(box: ArrayLike) -> "Similarity":
         """The similarity that brings `box`, (2, 3) corners input units, into the unit cube, its longest side to 1."""
-        box = np.asarray(box, dtype=np.float64)
-        scale = 1.0 / float((box[1] - box[0]).max())
-        return Similarity(scale, tuple(float(x) for x in -box[0] * scale))
+        low, high = np.asarray(box, dtype=np.float64)
+        scale = 1.0 / float((high - low).max())
+        return Similarity(scale, tuple(float(x) for x in -low * scale))
 
 
-def project(points, intrinsics, world_to_camera):
+def project(points: np.ndarray, intrinsics: np.ndarray, world_to_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pinhole projection of world points.
 
     points: (n, 3) world units. intrinsics: (3, 3) pixels. world_to_camera: (3, 4).
@@ -70,22 +71,22 @@ class Camera:
     height: int
 
     @property
-    def centre(self):
+    def centre(self) -> np.ndarray:
         """(3,) where it stands."""
         return -self.world_to_camera[:, :3].T @ self.world_to_camera[:, 3]
 
     @property
-    def planes(self):
+    def planes(self) -> np.ndarray:
         """(5, 4): the homogeneous images (u d, v d, d, 1) that are in sight have no negative product with any."""
         right, below = self.width - 0.5, self.height - 0.5
         return np.array([[0, 0, 1, -NEAR], [1, 0, 0.5, 0], [-1, 0, right, 0], [0, 1, 0.5, 0], [0, -1, below, 0]])
 
-    def homogeneous(self, points):
+    def homogeneous(self, points: np.ndarray) -> np.ndarray:
         """(n, 4): u d, v d, d and 1 of (n, 3) points at depth d."""
         seen = (points @ self.world_to_camera[:, :3].T + self.world_to_camera[:, 3]) @ self.intrinsics.T
         return np.column_stack([seen, np.ones(len(points))])
 
-    def project_lines(self, points, directions):
+    def project_lines(self, points: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(n, 2) pixels of (n, 3) points, (n, 2) unit images of their directions, and whether they are in sight."""
         seen, moved = self.homogeneous(points), directions @ (self.intrinsics @ self.world_to_camera[:, :3]).T
         inside = (self.planes @ seen.T >= 0).all(axis=0)
@@ -94,7 +95,7 @@ class Camera:
         along = moved[:, :2] - pixels * moved[:, 2:]
         return pixels, along / np.maximum(np.linalg.norm(along, axis=1), 1e-300)[:, None], inside
 
-    def slopes(self, points):
+    def slopes(self, points: np.ndarray) -> np.ndarray:
         """(n, 2, 3): px that the projection of each (n, 3) point moves for a unit step along each axis of the world."""
         homogeneous = self.homogeneous(points)
         depths = homogeneous[:, 2, None, None]
@@ -114,12 +115,12 @@ class Cameras:
     focal: np.ndarray
 
     @staticmethod
-    def of(matrices):
+    def of(matrices: np.ndarray) -> "Cameras":
         """From (V, 3, 4) matrices intrinsics @ world_to_camera."""
         centres = -np.linalg.solve(matrices[:, :, :3], matrices[:, :, 3:])[:, :, 0]
         return Cameras(matrices, centres, np.sqrt(np.abs(np.linalg.det(matrices[:, :, :3]))))
 
-    def project(self, points, views):
+    def project(self, points: np.ndarray, views: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (n, 2), NaN behind the camera, and depths (n,) of points (n, 3), each in its own view (n,)."""
         matrices = self.matrices[views]
         homogeneous = np.einsum("nij,nj->ni", matrices[:, :, :3], points) + matrices[:, :, 3]
@@ -127,19 +128,19 @@ class Cameras:
         return homogeneous[:, :2] / np.where(depths > NEAR, depths, np.nan)[:, None], depths
 
 
-def inside_image(pixels, width, height):
+def inside_image(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
     """(n,) bool: which of the (n, 2) pixels round to a pixel of the image (NaN does not)."""
     u, v = pixels[:, 0], pixels[:, 1]
     with np.errstate(invalid="ignore"):
         return (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
 
 
-def transform(matrix, points):
+def transform(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(n, 3) points through a (4, 4) affine matrix."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def invert_pose(camera_to_world):
+def invert_pose(camera_to_world: np.ndarray) -> np.ndarray:
     """(..., 4, 4) or (..., 3, 4) rigid camera-to-world -> (..., 3, 4) world-to-camera (or the other way round)."""
     rotation = np.swapaxes(camera_to_world[..., :3, :3], -1, -2)
     translation = -(rotation @ camera_to_world[..., :3, 3:4])

@@ -4,19 +4,21 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from taichi_edges.views.edgels import Edgels
+
 DRAWN_SIGMA = 1.0  # px; about what DexiNed draws (FWHM 2.4 px), wide enough to pull a Gaussian from 3 px away
 PATCH = 3  # px; half size of the patch in which an edgel is drawn
 DRAWN_AT_ONCE = 256  # points; few enough that their patches stay in the cache and in memory that is there already
 
 
-def draw_edge_maps(edgels, height, width, threads=None):
+def draw_edge_maps(edgels: Edgels, height: int, width: int, threads: int | None = None) -> np.ndarray:
     """(V, H, W) uint8 edge maps through the edgels, some views at a time.
 
     Every line is drawn at full height, or a weak one would teach its Gaussians to be faint, and be narrower from a
     threshold on: how sure an edgel is weighs in the loss instead.
     """
 
-    def draw(view):
+    def draw(view: int) -> np.ndarray:
         points, normals, _ = edgels.of_view(view)
         return draw_lines(points, normals, np.ones(len(points), np.float32), height, width)
 
@@ -24,7 +26,9 @@ def draw_edge_maps(edgels, height, width, threads=None):
         return np.stack(list(pool.map(draw, range(edgels.view_count))))
 
 
-def draw_lines(points, normals, values, height, width, sigma=DRAWN_SIGMA):
+def draw_lines(
+    points: np.ndarray, normals: np.ndarray, values: np.ndarray, height: int, width: int, sigma: float = DRAWN_SIGMA
+) -> np.ndarray:
     """(H, W) uint8 map of lines through the points: a Gaussian profile of `sigma` pixels across each, `value` high.
 
     A calibration may have moved points out of the image; those farther out than the patch is wide draw nothing.
@@ -41,7 +45,7 @@ def draw_lines(points, normals, values, height, width, sigma=DRAWN_SIGMA):
     return np.rint(image, out=image)[margin:-margin, margin:-margin].astype(np.uint8)
 
 
-def _draw_patches(image, points, normals, values, sigma):
+def _draw_patches(image: np.ndarray, points: np.ndarray, normals: np.ndarray, values: np.ndarray, sigma: float) -> None:
     """Draw some of the points into `image`, which is 2 PATCH pixels larger on every side."""
     centres = np.rint(points)
     patch = np.arange(2 * PATCH + 1)  # offsets from the point, and pixels: (n, 1, 7) right, (n, 7, 1) down

@@ -3,6 +3,7 @@
 Whatever detects edges gives edgels; the edge maps that the splatting learns from are drawn through them.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,43 +24,43 @@ class Edgels:
     normals: np.ndarray
     strengths: np.ndarray
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         count = len(self.points)
         assert self.points.shape == self.normals.shape == (count, 2) and self.strengths.shape == (count,)
         assert self.starts[0] == 0 and self.starts[-1] == count, self.starts
 
     @staticmethod
-    def of_views(views):
+    def of_views(views: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> "Edgels":
         """From an iterable with (points, normals, strengths) for each view."""
-        columns = list(zip(*views, strict=True)) or [[], [], []]
+        columns = list(zip(*views, strict=True)) or [()] * 3
         starts = np.concatenate([[0], np.cumsum([len(points) for points in columns[0]])]).astype(np.int64)
         shapes = ((0, 2), (0, 2), (0,))
         joined = (np.concatenate([np.zeros(shape), *column]) for shape, column in zip(shapes, columns, strict=True))
         return Edgels(starts, *(np.ascontiguousarray(array, np.float32) for array in joined))
 
     @property
-    def view_count(self):
+    def view_count(self) -> int:
         """Number of views, those without an edgel included."""
         return len(self.starts) - 1
 
     @property
-    def views(self):
+    def views(self) -> np.ndarray:
         """(n,) int64: the view of each edgel."""
         return np.repeat(np.arange(self.view_count), np.diff(self.starts))
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.points)
 
-    def of_view(self, view):
+    def of_view(self, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points (m, 2), normals (m, 2) and strengths (m,) of one view."""
         part = slice(self.starts[view], self.starts[view + 1])
         return self.points[part], self.normals[part], self.strengths[part]
 
-    def keep(self, chosen):
+    def keep(self, chosen: np.ndarray) -> "Edgels":
         """Only the chosen edgels. chosen: (n,) bool."""
         before = np.concatenate([[0], np.cumsum(chosen)]).astype(np.int64)
         return Edgels(before[self.starts], self.points[chosen], self.normals[chosen], self.strengths[chosen])
 
-    def moved(self, offsets):
+    def moved(self, offsets: np.ndarray) -> "Edgels":
         """The same edgels, their points moved by (n, 2) pixels."""
         return Edgels(self.starts, (self.points + offsets).astype(np.float32), self.normals, self.strengths)

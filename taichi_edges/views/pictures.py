@@ -37,7 +37,7 @@ class Picture:
     exponent: float | None = None
 
 
-def levels_per_light(light, exponent=None):
+def levels_per_light(light: np.ndarray, exponent: float | None = None) -> np.ndarray:
     """Grey levels of 255 by which the encoded value grows per unit of light, float32, same shape as `light`.
 
     exponent: None for sRGB.
@@ -50,7 +50,7 @@ def levels_per_light(light, exponent=None):
     return slope
 
 
-def as_picture(image, exponent=None):
+def as_picture(image: np.ndarray, exponent: float | None = None) -> Picture:
     """Picture of a decoded image, (H, W), (H, W, 1), (H, W, 3) BGR, or with straight alpha (H, W, 2) or (H, W, 4).
 
     8 and 16 bits are sRGB-encoded, which is what PNG and JPEG files of either depth hold unless they say otherwise;
@@ -68,7 +68,7 @@ def as_picture(image, exponent=None):
     return Picture(light, None if coverage.min() == 1.0 else coverage, exponent)
 
 
-def _decoded(values, exponent):
+def _decoded(values: np.ndarray, exponent: float | None) -> np.ndarray:
     """(H, W, C) float32 linear light."""
     if values.dtype.kind == "f":
         return np.nan_to_num(values.astype(np.float32), nan=0.0, posinf=1.0, neginf=0.0)
@@ -76,7 +76,7 @@ def _decoded(values, exponent):
     return (light_of_srgb(shades) if exponent is None else (shades**exponent).astype(np.float32))[values]
 
 
-def read_picture(path, exponent=None):
+def read_picture(path: Path | str, exponent: float | None = None) -> Picture:
     """Picture of an image file; UserError where it cannot be read. exponent: see `as_picture`."""
     path = Path(path)
     if not path.is_file():
@@ -91,7 +91,7 @@ def read_picture(path, exponent=None):
     return as_picture(image, exponent)
 
 
-def read_colour(path):
+def read_colour(path: Path | str) -> np.ndarray | None:
     """An image as people and learned detectors see it: (H, W, 3) uint8 BGR, what is transparent over white.
 
     Composited in linear light. None where the file cannot be read.
@@ -102,7 +102,7 @@ def read_colour(path):
         return None
     if image is None or image.dtype not in (np.uint8, np.uint16):
         return None
-    full = np.iinfo(image.dtype).max
+    full = 255 if image.dtype == np.uint8 else 65535
     colour = image if full == 255 else (image * (255.0 / full)).round().astype(np.uint8)
     if image.ndim == 2:
         return cv2.cvtColor(colour, cv2.COLOR_GRAY2BGR)
@@ -117,7 +117,7 @@ def read_colour(path):
     return colour
 
 
-def is_whole(path):
+def is_whole(path: Path) -> bool:
     """Does the file end as a whole file of its kind ends? Formats without a known end marker pass."""
     marker, size = END_MARKERS.get(path.suffix.lower()), path.stat().st_size
     with open(path, "rb") as file:

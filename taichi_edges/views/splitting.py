@@ -1,15 +1,17 @@
 """Which views are held out of everything but the evaluation."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from taichi_edges.errors import UserError, did_you_mean
 from taichi_edges.views.edgels import Edgels
+from taichi_edges.views.views import Views
 
 FEWEST_VIEWS, SHARE, MOST = 8, 10, 3  # auto: from so many views on, one in ten of them, at most three
 LEAST_LEFT = 3  # views to find edges in: the viewing planes of two always meet
 
 
-def choose_held_out(names, wanted):
+def choose_held_out(names: Sequence[str], wanted: str | int | list[str] | tuple[str, ...]) -> list[int]:
     """Indices of the views to hold out, ascending. wanted: 'auto', 'off', a number, or a tuple of names.
 
     Those that `auto` and a number choose are in the middles of equal stretches of all views; the first and the last
@@ -21,7 +23,7 @@ def choose_held_out(names, wanted):
                 raise UserError(f"evaluation.held_out: there is no view '{name}'{did_you_mean(name, list(names))}")
         chosen = {list(names).index(name) for name in wanted}
     else:
-        count = {"off": 0, "auto": _automatic(len(names))}.get(wanted, wanted)
+        count = {"off": 0, "auto": _automatic(len(names))}[wanted] if isinstance(wanted, str) else wanted
         middles = ((2 * number + 1) * len(names) // (2 * count) for number in range(count))
         chosen = {min(max(middle, 1), len(names) - 2) for middle in middles}
     left = len(names) - len(chosen)
@@ -31,18 +33,18 @@ def choose_held_out(names, wanted):
     return sorted(chosen)
 
 
-def _automatic(count):
+def _automatic(count: int) -> int:
     """How many of so many views `auto` holds out."""
     return min((count + SHARE // 2) // SHARE, MOST) if count >= FEWEST_VIEWS else 0
 
 
-def split_views(views, held_out):
+def split_views(views: Views, held_out: Sequence[int]) -> tuple[Views, Views]:
     """Views without those at the indices `held_out`, and Views of those alone."""
     rest = [view for view in range(len(views)) if view not in set(held_out)]
     return _some_views(views, rest), _some_views(views, held_out)
 
 
-def _some_views(views, chosen):
+def _some_views(views: Views, chosen: Sequence[int]) -> Views:
     edgels = views.edgels
     return replace(
         views,

@@ -2,7 +2,9 @@
 
 import functools
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -30,11 +32,11 @@ class Views:
     edgels:           Edgels, the sub-pixel points through which the edge maps are drawn; None before they are traced.
     """
 
-    names: tuple
+    names: tuple[str, ...]
     edge_maps: np.ndarray
     intrinsics: np.ndarray
     world_to_camera: np.ndarray
-    image_paths: tuple
+    image_paths: tuple[str, ...]
     similarity: Similarity = Similarity()
     box: np.ndarray = field(default_factory=lambda: np.array([[0.0, 0, 0], [1, 1, 1]]))
     input_to_truth: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -42,36 +44,36 @@ class Views:
     pixel: float | None = None
     tolerance_px: float = 0.5
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         count, height, width = self.edge_maps.shape
         assert self.edge_maps.dtype == np.uint8, self.edge_maps.dtype
         assert len(self.names) == len(self.image_paths) == count and len(set(self.names)) == count
         assert self.intrinsics.shape == (count, 3, 3) and self.world_to_camera.shape == (count, 3, 4)
         assert self.edgels is None or self.edgels.view_count == count
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.names)
 
     @property
-    def height(self):
+    def height(self) -> int:
         """Pixels."""
         return self.edge_maps.shape[1]
 
     @property
-    def width(self):
+    def width(self) -> int:
         """Pixels."""
         return self.edge_maps.shape[2]
 
-    def camera(self, view):
+    def camera(self, view: int) -> Camera:
         """The Camera of one view."""
         return Camera(self.intrinsics[view], self.world_to_camera[view], self.width, self.height)
 
-    def project(self, points, view):
+    def project(self, points: np.ndarray, view: int) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (n, 2), NaN behind the camera, and depths (n,) of (n, 3) unit-cube points in one view."""
         return project(points, self.intrinsics[view], self.world_to_camera[view])
 
 
-def pixel_size(views):
+def pixel_size(views: Views) -> float:
     """Size of a pixel at the scene, unit-cube units: `Views.pixel`, or else at the middle of the box."""
     if views.pixel is not None:
         return views.pixel
@@ -81,7 +83,7 @@ def pixel_size(views):
     return float(np.median(in_front / views.intrinsics[:, 0, 0]))
 
 
-def write_views(path, views):
+def write_views(path: Path | str, views: Views) -> Path:
     """Write `views.npz` (compressed NumPy archive; the keys are the fields of `Views`)."""
     with replacing(path) as unfinished, open(unfinished, "wb") as file:
         np.savez_compressed(
@@ -99,16 +101,16 @@ def write_views(path, views):
             tolerance_px=views.tolerance_px,
             **{f"edgel_{name}": getattr(views.edgels, name) for name in EDGEL_ARRAYS if views.edgels is not None},
         )
-    return path
+    return Path(path)
 
 
-def read_views(path):
+def read_views(path: Path | str) -> Views:
     """Read `views.npz`. Every stage does: as long as the file stays the same, they share the arrays, read-only."""
     return _views_of(os.fspath(path), file_state(path))
 
 
 @functools.lru_cache(maxsize=2)  # the views that edges are made from, and those held out
-def _views_of(path, _state):
+def _views_of(path: str, _state: tuple[int, ...]) -> Views:
     with np.load(path) as archive:
         views = Views(
             names=tuple(str(name) for name in archive["names"]),
@@ -130,13 +132,13 @@ def _views_of(path, _state):
     return views
 
 
-def _edgels_of(archive):
+def _edgels_of(archive: Mapping[str, np.ndarray]) -> Edgels | None:
     if "edgel_starts" not in archive:
         return None
     return Edgels(*(archive[f"edgel_{name}"] for name in EDGEL_ARRAYS))
 
 
-def choose_views(views, count):
+def choose_views(views: Views, count: int) -> list[int]:
     """Indices, in order, of at most `count` views: the first, then always the one farthest from those chosen.
 
     Far is by the angle between viewing directions; where all look the same way, by the place in the sequence.
