@@ -1,9 +1,14 @@
 """Curves as dense polylines, for distances to them that are as good as exact, and samples along curves."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 STEP = 0.0005  # normalised units between the vertices: far less than the radius of any edge that views can resolve
 
@@ -22,19 +27,19 @@ class DenseCurves:
     tangents: np.ndarray
 
     @cached_property
-    def tree(self):
+    def tree(self) -> "cKDTree":
         """k-d tree of the vertices."""
         from scipy.spatial import cKDTree
 
         return cKDTree(self.points)
 
-    def distances(self, points):
+    def distances(self, points: np.ndarray) -> np.ndarray:
         """(n, 3) points -> (n,) distances to the nearest curve; infinite where there is none."""
         if not len(self.points) or not len(points):
             return np.full(len(points), np.inf)
         return self.distances_near(points, self.tree.query(points)[1])
 
-    def distances_near(self, points, vertices):
+    def distances_near(self, points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
         """(n,) distances of points (n, 3) to the chords on both sides of the vertices (n,) that are nearest to them.
 
         A vertex is up to half a STEP from the foot of the perpendicular; the chords are not.
@@ -50,7 +55,7 @@ class DenseCurves:
             found = np.minimum(found, np.linalg.norm(points - feet, axis=1))
         return found
 
-    def within(self, points, radius):
+    def within(self, points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Which curves pass within `radius` of which of the (n, 3) points.
 
         Returns the index of the point, of the polyline, of the polyline's vertex that is nearest to the point, and the
@@ -71,7 +76,7 @@ class DenseCurves:
         return at[near], self.owners[vertices[near]], vertices[near], found[near]
 
 
-def dense_curves(polylines):
+def dense_curves(polylines: Sequence[np.ndarray]) -> DenseCurves:
     """A list of (m, 3) polylines -> DenseCurves, every vertex of theirs kept; one of no length has no chord."""
     points, owners, tangents = [np.zeros((0, 3))], [np.zeros(0, np.int64)], [np.zeros((0, 3))]
     for index, polyline in enumerate(polylines):
@@ -82,7 +87,7 @@ def dense_curves(polylines):
     return DenseCurves(np.concatenate(points), np.concatenate(owners), np.concatenate(tangents))
 
 
-def subdivided(polyline):
+def subdivided(polyline: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(m, 3) polyline -> (n, 3) vertices at most STEP apart, and the (n, 3) `tangents` of DenseCurves."""
     chords = np.diff(polyline, axis=0)
     lengths = np.linalg.norm(chords, axis=1)
@@ -97,7 +102,7 @@ def subdivided(polyline):
     return np.concatenate([vertices, polyline[-1:]]), np.concatenate([directions, directions[-1:]])
 
 
-def middle_samples(polylines, spacing):
+def middle_samples(polylines: Sequence[np.ndarray], spacing: float) -> tuple[np.ndarray, ...]:
     """The middles of equal steps of at most `spacing` along each polyline; none for one of no length.
 
     Returns points (n, 3), unit tangents (n, 3), step lengths (n,), the index of the polyline (n,), and (n, 2) bool:

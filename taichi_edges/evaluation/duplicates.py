@@ -1,5 +1,7 @@
 """How much of the length of a set of edges says again what a longer edge says already."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from taichi_edges.evaluation.dense_curves import middle_samples
@@ -9,7 +11,7 @@ DUPLICATE_DISTANCE = 0.005  # normalised units: the finest threshold, below whic
 DUPLICATE_COSINE = 0.9  # between tangents: edges that meet at more than 26 degrees never count as parallel
 
 
-def duplicated_percent(polylines, sources):
+def duplicated_percent(polylines: Sequence[np.ndarray], sources: np.ndarray) -> float:
     """Percent of the length of the polylines that repeats what another, longer edge says already.
 
     polylines: list of (m, 3). sources: (P,) int, pieces of one edge share it.
@@ -41,7 +43,7 @@ def duplicated_percent(polylines, sources):
     return float(100.0 * steps[duplicated].sum() / total)
 
 
-def rank_pieces(lengths, sources):
+def rank_pieces(lengths: np.ndarray, sources: np.ndarray) -> np.ndarray:
     """(P,) lengths and sources -> (P,) the turn in which each piece is counted: 0 for a piece of the longest edge."""
     _, edge = np.unique(sources, return_inverse=True)
     edge_lengths = np.bincount(edge, weights=lengths)
@@ -51,7 +53,9 @@ def rank_pieces(lengths, sources):
     return rank
 
 
-def neighbours_counted_before(points, pieces, rank):
+def neighbours_counted_before(
+    points: np.ndarray, pieces: np.ndarray, rank: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """For every sample, the nearest sample of each piece counted before its own, if within DUPLICATE_DISTANCE.
 
     Returns two (k,) index arrays: the sample, and its neighbour on the earlier piece.
@@ -70,7 +74,7 @@ def neighbours_counted_before(points, pieces, rank):
     return later[nearest], earlier[nearest]
 
 
-def mark_in_turn(later, earlier, turns):
+def mark_in_turn(later: np.ndarray, earlier: np.ndarray, turns: np.ndarray) -> np.ndarray:
     """(n,) bool: the samples that repeat one which is not a duplicate itself, decided turn by turn.
 
     later, earlier: (k,) pairs of samples. turns: (n,) the turn of every sample.

@@ -5,12 +5,13 @@ end       an end of a piece, unless another piece of the same edge, or the piece
 joined    two ends, or an end and a point along another piece, that are at most JOINED apart.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from taichi_edges.evaluation.dense_curves import dense_curves
+from taichi_edges.evaluation.dense_curves import DenseCurves, dense_curves
 from taichi_edges.evaluation.primitives import CORNER_DEGREES, JOINED
 
 
@@ -21,27 +22,27 @@ class EdgeGraph:
     polylines: list of (m, 3) pieces. edges: (P,) int, the edge of each piece, numbered from 0.
     """
 
-    polylines: list
+    polylines: list[np.ndarray]
     edges: np.ndarray
 
     @cached_property
-    def dense(self):
+    def dense(self) -> DenseCurves:
         """DenseCurves of the pieces."""
         return dense_curves(self.polylines)
 
     @cached_property
-    def lengths(self):
+    def lengths(self) -> np.ndarray:
         """(E,) the length of each edge."""
         sizes = [np.linalg.norm(np.diff(polyline, axis=0), axis=1).sum() for polyline in self.polylines]
         return np.bincount(self.edges, weights=sizes)
 
     @cached_property
-    def ends(self):
+    def ends(self) -> "Ends":
         """The Ends of all edges."""
         return edge_ends(self.polylines, self.edges)
 
     @cached_property
-    def contacts(self):
+    def contacts(self) -> tuple[np.ndarray, np.ndarray]:
         """Two (k,) arrays, an end and a piece that it is joined with: another's interior, or any other end."""
         return contacts_of(self)
 
@@ -56,15 +57,15 @@ class Ends:
     edges: np.ndarray
 
 
-def edge_graph(polylines, sources):
+def edge_graph(polylines: Sequence[np.ndarray], sources: np.ndarray | Sequence[int]) -> EdgeGraph:
     """Pieces (m, 3) and the (P,) source of each -> EdgeGraph; pieces of no length are left out."""
     sizes = np.array([np.ptp(polyline, axis=0).max() for polyline in polylines])
     kept = np.flatnonzero(sizes > 0)
     _, edges = np.unique(np.asarray(sources, dtype=np.int64)[kept], return_inverse=True)
-    return EdgeGraph([polylines[index] for index in kept], edges)
+    return EdgeGraph([polylines[index] for index in kept.tolist()], edges)
 
 
-def edge_ends(polylines, edges):
+def edge_ends(polylines: Sequence[np.ndarray], edges: np.ndarray) -> Ends:
     """The Ends of the pieces at which the edge does not go on."""
     if not polylines:
         return Ends(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64))
@@ -79,7 +80,7 @@ def edge_ends(polylines, edges):
     return Ends(points[kept], outward[kept], pieces[kept], edges[pieces[kept]])
 
 
-def direction_from(polyline):
+def direction_from(polyline: np.ndarray) -> np.ndarray:
     """(m, 3) polyline -> unit direction of its first chord that has a length."""
     chords = np.diff(polyline, axis=0)
     lengths = np.linalg.norm(chords, axis=1)
@@ -87,7 +88,7 @@ def direction_from(polyline):
     return chords[first] / lengths[first]
 
 
-def close_pairs(points):
+def close_pairs(points: np.ndarray) -> np.ndarray:
     """(k, 2) pairs of the points that are at most JOINED apart, in ascending order."""
     from scipy.spatial import cKDTree
 
@@ -97,7 +98,7 @@ def close_pairs(points):
     return pairs[np.lexsort(pairs.T[::-1])]
 
 
-def contacts_of(frame):
+def contacts_of(frame: EdgeGraph) -> tuple[np.ndarray, np.ndarray]:
     """The `contacts` of an EdgeGraph. An end is always near its own piece: only the piece's other end counts there."""
     ends = frame.ends
     at, pieces, _, _ = frame.dense.within(ends.points, JOINED)
@@ -109,7 +110,7 @@ def contacts_of(frame):
     )
 
 
-def free_ends(frame):
+def free_ends(frame: EdgeGraph) -> np.ndarray:
     """(f, 3) the ends of edges that nothing is joined with."""
     joined = np.zeros(len(frame.ends.points), dtype=bool)
     joined[frame.contacts[0]] = True

@@ -25,10 +25,10 @@ class EdgelIndex:
     normals: np.ndarray
     order: np.ndarray
     starts: np.ndarray
-    size: tuple
+    size: tuple[int, int]
 
     @staticmethod
-    def of(points, normals, width, height):
+    def of(points: np.ndarray, normals: np.ndarray, width: int, height: int) -> "EdgelIndex":
         """Of the (e, 2) points and unit normals of a view."""
         columns, rows = np.clip(np.rint(points.T), 0, [[width - 1], [height - 1]]).astype(np.int32)
         pixels = rows * np.int32(width) + columns
@@ -38,7 +38,7 @@ class EdgelIndex:
         points, normals = (np.asarray(array, np.float32) for array in (points, normals))
         return EdgelIndex(points, normals, order, starts, (width, height))
 
-    def pairs(self, places, radius):
+    def pairs(self, places: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Which edgels lie within `radius` px of which of the (n, 2) places.
 
         Returns the index of the place, ascending, that of the edgel, and the (k, 2) px from the edgel to the place.
@@ -59,7 +59,9 @@ class EdgelIndex:
         near = away[:, 0] ** 2 + away[:, 1] ** 2 <= np.float32(radius**2)
         return at[near], found[near], away[near]
 
-    def agreeing(self, places, directions, radius):
+    def agreeing(
+        self, places: np.ndarray, directions: np.ndarray, radius: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The `pairs` of places with unit directions (n, 2) and edgels that run the same way.
 
         Returns the index of the place, ascending, that of the edgel, and the (k,) px from the edgel across it.
@@ -69,7 +71,7 @@ class EdgelIndex:
         agree = np.abs(normals[:, 0] * along[:, 0] + normals[:, 1] * along[:, 1]) <= MOST_SINE
         return at[agree], found[agree], (normals[:, 0] * away[:, 0] + normals[:, 1] * away[:, 1])[agree]
 
-    def on_long_edges(self):
+    def on_long_edges(self) -> np.ndarray:
         """(e,) bool: which edgels belong to chains that extend over LONG_PX and do not wind like a texture's."""
         along = np.stack([-self.normals[:, 1], self.normals[:, 0]], axis=1)
         one, other, away = self.pairs(self.points, LINK_PX)
@@ -83,7 +85,7 @@ class EdgelIndex:
         lengths, extents = self._chain_sizes(count, chains)
         return ((extents >= LONG_PX) & (lengths <= MOST_WINDING * extents))[chains]
 
-    def _chain_sizes(self, count, chains):
+    def _chain_sizes(self, count: int, chains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(c,) pixels that each chain covers, and (c,) px of the diagonal of its bounding box. chains: (e,) int."""
         columns, rows = np.clip(np.rint(self.points.T).astype(np.int64), 0, np.array(self.size)[:, None] - 1)
         pixels = self.size[0] * self.size[1]

@@ -11,8 +11,10 @@ the function `to_unit`, so that a "mm" means the same whatever the units of the 
 """
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -42,19 +44,19 @@ class GroundTruth:
     """
 
     points: np.ndarray
-    curves: tuple
-    kinds: tuple
+    curves: tuple[np.ndarray, ...]
+    kinds: tuple[str, ...]
     length: float | None
     source: str
     own_frame: bool = False
 
 
-def as_it_is(points):
+def as_it_is(points: np.ndarray) -> np.ndarray:
     """(n, 3) points that are normalised already."""
     return points
 
 
-def read_ground_truth(path, to_unit=as_it_is):
+def read_ground_truth(path: Path | str, to_unit: Callable[[np.ndarray], np.ndarray] = as_it_is) -> GroundTruth:
     """Read the ground truth at `path`: an ABC folder, a sampled `.ply` or an edge `.json`. Returns a GroundTruth.
 
     to_unit: affine function (n, 3) -> (n, 3) from the scene's truth frame to its unit cube, for `.ply` and `.json`.
@@ -64,7 +66,7 @@ def read_ground_truth(path, to_unit=as_it_is):
     return read_abc(path) if path.is_dir() else FILE_READERS[path.suffix.lower()](path, to_unit)
 
 
-def refuse_unknown(path):
+def refuse_unknown(path: Path) -> None:
     """UserError for what cannot be a ground truth, by names alone: quick enough to ask before the training."""
     if path.is_dir():
         if only_file(path, "*_features_*.yml") is None:
@@ -76,7 +78,7 @@ def refuse_unknown(path):
         raise UserError(f"{path}: not a ground truth; give an ABC folder, a sampled .ply or an edge .json")
 
 
-def polyline_length(polyline):
+def polyline_length(polyline: np.ndarray) -> float:
     """(m, 3) polyline -> its length."""
     return float(np.linalg.norm(np.diff(polyline, axis=0), axis=1).sum())
 
@@ -84,9 +86,10 @@ def polyline_length(polyline):
 # ---------------------------------------------------------------------------------------------------- ABC folders
 
 
-def read_abc(folder):
+def read_abc(folder: Path) -> GroundTruth:
     """The sharp curves of an ABC folder, sampled as EMAP samples them."""
     features = only_file(folder, "*_features_*.yml")
+    assert features is not None, "see refuse_unknown"
     sharp = read_sharp_curves(features)
     frame = read_frame(folder / "stats.json", scene=features.name.split("_")[0])
     mesh = only_file(folder, "*_trimesh_*.obj")
@@ -102,7 +105,7 @@ def read_abc(folder):
     return GroundTruth(frame.to_unit(points), curves, kinds, sum(map(polyline_length, curves)), source, own_frame=True)
 
 
-def only_file(folder, pattern):
+def only_file(folder: Path, pattern: str) -> Path | None:
     """The one file of `folder` that matches, or None; several are refused, for any choice could be the wrong one."""
     found = sorted(folder.glob(pattern))
     if len(found) > 1:
@@ -111,7 +114,7 @@ def only_file(folder, pattern):
     return found[0] if found else None
 
 
-def read_sharp_curves(path):
+def read_sharp_curves(path: Path) -> list[dict[str, Any]]:
     """The sharp curves of a features yml, as the dicts they are. Raises UserError where there are none."""
     import yaml
 
@@ -130,7 +133,7 @@ def read_sharp_curves(path):
     return sharp
 
 
-def read_frame(path, scene):
+def read_frame(path: Path, scene: str) -> Similarity:
     """The Similarity from raw CAD units to the unit cube around 0.5, from the `bbox` of the scene in stats.json."""
     stats = read_json(path, "the bounding box (bbox) of the model by scene id")
     if not isinstance(stats, dict) or scene not in stats:
@@ -144,7 +147,7 @@ def read_frame(path, scene):
     return Similarity(scale, tuple(float(x) for x in 0.5 - scale * (low + high) / 2))
 
 
-def look_up_vertices(sharp, mesh, features):
+def look_up_vertices(sharp: list[dict[str, Any]], mesh: Path, features: Path) -> list[np.ndarray]:
     """One (m, 3) polyline in raw CAD units for each curve, from the vertices of the obj."""
     try:
         with open(mesh, encoding="utf-8") as file:
@@ -155,13 +158,14 @@ def look_up_vertices(sharp, mesh, features):
         raise UserError(f"{mesh}: {what}; copy both again") from error
 
 
-def rebuild_vertices(sharp, longest_side, features):
+def rebuild_vertices(sharp: list[dict[str, Any]], longest_side: float, features: Path) -> list[np.ndarray]:
     """One (m, 3) polyline in raw CAD units for each curve, from the curve's own parameters.
 
     Curves that meet share vertex indices. A shared vertex that two curves put in different places means that the
     parameters were not understood, and is refused.
     """
-    polylines, seen = [], {}
+    polylines: list[np.ndarray] = []
+    seen: dict[int, np.ndarray] = {}
     for number, curve in enumerate(sharp):
         polyline = rebuild_curve(curve)
         missing = f"its vertices need {features.stem.replace('features', 'trimesh')}.obj, which is not there"
@@ -174,7 +178,7 @@ def rebuild_vertices(sharp, longest_side, features):
     return polylines
 
 
-def rebuild_curve(curve):
+def rebuild_curve(curve: dict[str, Any]) -> np.ndarray | None:
     """The (m, 3) vertices of a Line or a Circle in raw CAD units; None for other types and malformed curves."""
     try:
         t = true_parameters(curve["vert_parameters"])
@@ -191,7 +195,7 @@ def rebuild_curve(curve):
     return None
 
 
-def true_parameters(stored):
+def true_parameters(stored: list[float]) -> np.ndarray | None:
     """(m,) stored vert_parameters -> the true ones, or None.
 
     The first and the last are always stored as they are; those between may be multiplied by INTERIOR_FACTOR. Vertices
@@ -207,7 +211,7 @@ def true_parameters(stored):
     return None
 
 
-def sample_mesh_segments(polyline):
+def sample_mesh_segments(polyline: np.ndarray) -> np.ndarray:
     """EMAP's samples of one curve (get_gt_points): (m, 3) raw vertices -> (n, 3) raw points.
 
     Each mesh segment gets int(length // ABC_SPACING) points, both ends included, from its end back to its start.
@@ -224,7 +228,7 @@ def sample_mesh_segments(polyline):
 # ---------------------------------------------------------------------------------------------------- single files
 
 
-def read_sampled_ply(path, to_unit=as_it_is):
+def read_sampled_ply(path: Path, to_unit: Callable[[np.ndarray], np.ndarray] = as_it_is) -> GroundTruth:
     """A point cloud as the truth: no curves, no length. to_unit: as in `read_ground_truth`."""
     import open3d
 
@@ -235,7 +239,7 @@ def read_sampled_ply(path, to_unit=as_it_is):
     return GroundTruth(to_unit(points), (), (), None, f"sampled points of {path.name}")
 
 
-def read_edge_file(path, to_unit=as_it_is):
+def read_edge_file(path: Path, to_unit: Callable[[np.ndarray], np.ndarray] = as_it_is) -> GroundTruth:
     """An edge file as the truth, of EMAP's kind or with a list `edges`, sampled every EDGE_FILE_SPACING.
 
     to_unit: as in `read_ground_truth`.
@@ -257,9 +261,10 @@ def read_edge_file(path, to_unit=as_it_is):
     return GroundTruth(points, curves, kinds, float(edges.lengths.sum()), f"edges of {path.name}")
 
 
-def edges_of_list(path, entries):
+def edges_of_list(path: Path, entries: list[dict[str, Any]]) -> EdgeSet:
     """Entries {edge: number, kind: line or bezier, p: (2, 3) or (4, 3)} -> EdgeSet, the number being the source."""
-    points, sources = {"line": [], "bezier": []}, {"line": [], "bezier": []}
+    points: dict[str, list[np.ndarray]] = {"line": [], "bezier": []}
+    sources: dict[str, list[int]] = {"line": [], "bezier": []}
     for number, entry in enumerate(entries):
         try:
             shape = {"line": (2, 3), "bezier": (4, 3)}[entry["kind"]]
@@ -272,7 +277,7 @@ def edges_of_list(path, entries):
     return EdgeSet(lines, curves, *(np.array(sources[kind], dtype=np.int64) for kind in ("line", "bezier")))
 
 
-def join_pieces(edges):
+def join_pieces(edges: EdgeSet) -> tuple[tuple[np.ndarray, ...], tuple[str, ...]]:
     """EdgeSet -> tuple of (m, 3) polylines and tuple of their kinds, one for each edge.
 
     A Bezier piece that starts where the piece before it ends, and shares its source, goes on with that polyline.
@@ -290,7 +295,7 @@ def join_pieces(edges):
     return tuple(curves), tuple(kinds)
 
 
-def read_json(path, what):
+def read_json(path: Path, what: str) -> Any:
     """The content of a JSON file; UserError where it is missing or broken. what: what it should hold, in words."""
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
@@ -300,7 +305,7 @@ def read_json(path, what):
         raise UserError(f"{path}: broken JSON ({one_line(error)}); copy it again") from error
 
 
-def one_line(error):
+def one_line(error: Exception) -> str:
     """The first line of an exception's text, with its kind where the text alone (a missing key) says little."""
     text = str(error).strip().splitlines()
     return f"{type(error).__name__}: {text[0]}" if text else type(error).__name__

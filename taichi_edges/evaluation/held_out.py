@@ -7,14 +7,15 @@ to be hidden from there, and is not judged. A place that no more of them see tha
 edge that does not exist.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from taichi_edges.evaluation.edgel_index import MOST_SINE, EdgelIndex
-from taichi_edges.evaluation.projected_curves import Chords
+from taichi_edges.evaluation.projected_curves import Chords, Traces
 from taichi_edges.views.splitting import LEAST_LEFT
-from taichi_edges.views.views import pixel_size
+from taichi_edges.views.views import Views, pixel_size
 
 MATCH_PX = 1.5  # an edge and an edgel so near are one, if they are parallel too (MOST_SINE); as in `edge_support`
 REACH_PX = 3.0  # within which residuals are looked at: what is this far off is no match, but neither hidden
@@ -48,8 +49,9 @@ class Visibility:
     real: np.ndarray
 
     @staticmethod
-    def of(places, tangents, views):
+    def of(places: np.ndarray, tangents: np.ndarray, views: Views) -> "Visibility":
         """Of (n, 3) places with unit tangents, unit cube, in Views."""
+        assert views.edgels is not None
         inside, seen, matched = np.zeros((3, len(places), len(views)), bool)
         towards, chance = np.zeros((len(places), len(views), 3)), np.zeros(len(views))
         for view in range(len(views)):
@@ -66,7 +68,7 @@ class Visibility:
         enough = np.maximum(expected + SURE * np.sqrt(variance), LEAST_LEFT)
         return Visibility(places, inside, seen, towards, matched.sum(axis=1) >= enough)
 
-    def judged_from(self, centre):
+    def judged_from(self, centre: np.ndarray) -> np.ndarray:
         """(n,) bool: which places a view from `centre` (3,) ought to show, or are nowhere to be seen."""
         cosines = np.einsum("nvc,nc->nv", self.towards, _unit(centre - self.places))
         nearest = np.argsort(np.where(self.inside, -cosines, np.inf), axis=1, kind="stable")[:, :NEIGHBORS]
@@ -75,11 +77,11 @@ class Visibility:
         return ~self.real | ((weights * seen).sum(axis=1) >= VISIBLE * weights.sum(axis=1))
 
 
-def _unit(vectors):
+def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
 
 
-def chance_of_match(points):
+def chance_of_match(points: np.ndarray) -> float:
     """Share of the places of an image within whose MATCH_PX some edgel happens to run their way. points: (e, 2)."""
     if not len(points):
         return 0.0
@@ -113,7 +115,7 @@ class Score:
     residuals: np.ndarray
 
 
-def held_out_metrics(polylines, training, held_out):
+def held_out_metrics(polylines: Sequence[np.ndarray], training: Views, held_out: Views) -> dict[str, float | None]:
     """The metrics of edges in held-out views, a dict that JSON can hold; None where a number does not exist.
 
     polylines: list of (m, 3), unit cube. training: Views that the edges were made from. held_out: Views.
@@ -128,8 +130,9 @@ def held_out_metrics(polylines, training, held_out):
     return {"held_out_views": len(held_out), **metrics_of(scores)}
 
 
-def score_view(chords, ends, sightings, views, view):
+def score_view(chords: Chords, ends: np.ndarray, sightings: Visibility, views: Views, view: int) -> Score:
     """Score of Chords in one of some Views. ends: (n,) where on the Chords the stretch of each place ends."""
+    assert views.edgels is not None
     camera, (points, normals, strengths) = views.camera(view), views.edgels.of_view(view)
     index = EdgelIndex.of(points, normals, views.width, views.height)
     traces = chords.in_image(camera, SPACING_PX)
@@ -146,14 +149,20 @@ def score_view(chords, ends, sightings, views, view):
     matched = judged & (distances <= MATCH_PX)
     displaced, by_chance = _displaced(index, traces, judged)
     return Score(
-        *(float(traces.lengths[some].sum()) for some in (slice(None), judged, matched)),
-        *(displaced, by_chance),
-        *(float(strengths[some].sum(dtype=np.float64)) for some in (slice(None), explained, long, long & explained)),
+        length=float(traces.lengths.sum()),
+        judged=float(traces.lengths[judged].sum()),
+        matched=float(traces.lengths[matched].sum()),
+        displaced=displaced,
+        by_chance=by_chance,
+        edgels=float(strengths.sum(dtype=np.float64)),
+        explained=float(strengths[explained].sum(dtype=np.float64)),
+        long_edgels=float(strengths[long].sum(dtype=np.float64)),
+        long_explained=float(strengths[long & explained].sum(dtype=np.float64)),
         residuals=np.abs(beside[nearest]),
     )
 
 
-def _displaced(index, traces, judged):
+def _displaced(index: EdgelIndex, traces: Traces, judged: np.ndarray) -> tuple[float, float]:
     """Length of judged samples that are displaced to both sides, and of those of them that match there, px."""
     some = np.flatnonzero(judged)[::ASIDE_EVERY]
     length = matched = 0.0
@@ -165,10 +174,10 @@ def _displaced(index, traces, judged):
     return float(length), float(matched)
 
 
-def metrics_of(scores):
+def metrics_of(scores: Sequence[Score]) -> dict[str, float | None]:
     """The shares and residuals of all views together."""
 
-    def percent(part, whole):
+    def percent(part: str, whole: str) -> float | None:
         total = sum(getattr(score, whole) for score in scores)
         return 100.0 * sum(getattr(score, part) for score in scores) / total if total else None
 

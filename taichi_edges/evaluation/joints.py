@@ -6,13 +6,14 @@ reached   every true edge that ends there has a predicted edge that follows it a
 closed    reached by edges that are joined with each other there.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from taichi_edges.evaluation.dense_curves import middle_samples
 from taichi_edges.evaluation.duplicates import DUPLICATE_COSINE
-from taichi_edges.evaluation.edge_graph import close_pairs
+from taichi_edges.evaluation.edge_graph import EdgeGraph, close_pairs
 from taichi_edges.evaluation.primitives import CORNER_DEGREES, JOINED, grouped
 
 REACH = 0.005  # normalised units: EMAP's finest threshold; an edge that ends farther from a corner has missed it
@@ -29,17 +30,17 @@ class Joint:
     """
 
     point: np.ndarray
-    ends: dict
-    passing: tuple
+    ends: dict[int, int]
+    passing: tuple[int, ...]
     angle: float
 
     @property
-    def is_corner(self):
+    def is_corner(self) -> bool:
         """Do some edges meet at an angle here? Otherwise all touch, or continue each other."""
         return self.angle > CORNER_DEGREES
 
 
-def find_joints(truth):
+def find_joints(truth: EdgeGraph) -> list[Joint]:
     """EdgeGraph of the true edges, each of one piece -> list of Joint; an end that meets no other edge is none."""
     ends = truth.ends
     joints = []
@@ -55,12 +56,12 @@ def find_joints(truth):
     return joints
 
 
-def widest_angle(directions):
+def widest_angle(directions: np.ndarray) -> float:
     """(k, 3) unit directions -> the greatest angle between two of them in degrees, their sense disregarded."""
     return float(np.degrees(np.arccos(np.clip(np.abs(directions @ directions.T).min(), 0.0, 1.0))))
 
 
-def followers(predicted, truth):
+def followers(predicted: EdgeGraph, truth: EdgeGraph) -> np.ndarray:
     """(predicted edges, true edges) bool: does the one follow the other?
 
     A sample of a predicted edge belongs to the nearest true edge within REACH that is parallel to it there. An edge
@@ -90,13 +91,15 @@ class Arrivals:
     """
 
     edges: np.ndarray
-    follows: dict
+    follows: dict[int, np.ndarray]
     ends: np.ndarray
     end_counts: np.ndarray
     passes: np.ndarray
 
 
-def judge_joints(predicted, follows, joints, reach=REACH):
+def judge_joints(
+    predicted: EdgeGraph, follows: np.ndarray, joints: Sequence[Joint], reach: float = REACH
+) -> np.ndarray:
     """For each joint, whether it is reached and whether it is closed: (J, 2) bool.
 
     follows: as from `followers`. reach: how near to a joint an edge has to end, normalised units.
@@ -116,7 +119,9 @@ def judge_joints(predicted, follows, joints, reach=REACH):
     return verdicts
 
 
-def arrivals_at(predicted, joint, follows, near, ends):
+def arrivals_at(
+    predicted: EdgeGraph, joint: Joint, follows: np.ndarray, near: np.ndarray, ends: np.ndarray
+) -> Arrivals:
     """The Arrivals at a joint. follows: as from `followers`. near, ends: the edges and the ends within reach of it."""
     edges = near[follows[near][:, [*joint.ends, *joint.passing]].any(axis=1)]
     followed = {true_edge: follows[edges, true_edge] for true_edge in (*joint.ends, *joint.passing)}
@@ -125,7 +130,7 @@ def arrivals_at(predicted, joint, follows, near, ends):
     return Arrivals(edges, followed, ends, end_counts, (end_counts == 0) & (ways > 1))
 
 
-def joined_groups(predicted, joint, arrivals, reach):
+def joined_groups(predicted: EdgeGraph, joint: Joint, arrivals: Arrivals, reach: float) -> list[list[int]]:
     """The edges that are joined at a joint: list of lists of indices into `arrivals.edges`.
 
     An end joins what it touches. Edges without an end here are joined if they touch each other and both pass.
@@ -133,15 +138,15 @@ def joined_groups(predicted, joint, arrivals, reach):
     place = {int(edge): index for index, edge in enumerate(arrivals.edges)}
     ends, pieces = predicted.contacts
     here = np.isin(ends, arrivals.ends)
-    pairs = zip(predicted.ends.edges[ends[here]].tolist(), predicted.edges[pieces[here]].tolist(), strict=True)
-    pairs = [(place[one], place[other]) for one, other in pairs if one in place and other in place]
+    met = zip(predicted.ends.edges[ends[here]].tolist(), predicted.edges[pieces[here]].tolist(), strict=True)
+    pairs = [(place[one], place[other]) for one, other in met if one in place and other in place]
     if np.count_nonzero(arrivals.passes) > 1:
         touching = touching_edges(predicted, joint, arrivals.edges, reach)
         pairs += [pair for pair in touching if arrivals.passes[list(pair)].all()]
     return grouped(len(place), pairs)
 
 
-def touching_edges(predicted, joint, edges, reach):
+def touching_edges(predicted: EdgeGraph, joint: Joint, edges: np.ndarray, reach: float) -> list[tuple[int, int]]:
     """List of pairs of indices into `edges`, predicted ones that come within JOINED of each other near the joint."""
     dense = predicted.dense
     vertices = np.array(dense.tree.query_ball_point(joint.point, reach), dtype=np.int64)
@@ -152,7 +157,7 @@ def touching_edges(predicted, joint, edges, reach):
     return [tuple(pair) for pair in np.searchsorted(edges, pairs).tolist()]
 
 
-def all_served(joint, arrivals, chosen):
+def all_served(joint: Joint, arrivals: Arrivals, chosen: np.ndarray | list[int]) -> bool:
     """Is every true edge of the joint served by the chosen (c,) indices into `arrivals.edges`?
 
     A true edge that ends here wants ends of edges that follow it, as many as it has; an edge that follows it and passes

@@ -11,16 +11,22 @@ One "mm" is 0.001 of the normalised unit. Edges and truth must be in the same fr
 """
 
 from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from taichi_edges.errors import UserError
 from taichi_edges.evaluation.dense_curves import STEP
 from taichi_edges.evaluation.duplicates import duplicated_percent
-from taichi_edges.evaluation.edge_graph import edge_graph, free_ends
+from taichi_edges.evaluation.edge_graph import EdgeGraph, edge_graph, free_ends
 from taichi_edges.evaluation.primitives import true_primitives
 from taichi_edges.evaluation.wireframe_metrics import wireframe_metrics
 from taichi_edges.geometry.bezier import evaluate_bezier
+
+if TYPE_CHECKING:
+    from taichi_edges.evaluation.ground_truth import GroundTruth
+    from taichi_edges.geometry.edge_set import EdgeSet
 
 SAMPLE_SPACING = 0.005  # normalised units, EMAP sample_resolution
 VOXELS_PER_UNIT = 128  # EMAP: 256 voxels over [-1, 1] on each axis
@@ -30,7 +36,7 @@ HELD_OUT_SHARES = ("precision", "chance", "judged", "recall_long", "recall", "f_
 FEWEST_CHORDS = 16  # of a cubic, for exact distances; one of 90 degrees is met to 0.1 % of its radius
 
 
-def evaluate(edges, truth):
+def evaluate(edges: "EdgeSet", truth: "GroundTruth") -> dict[str, float | None]:
     """The metrics of `edges`, an EdgeSet, against `truth`, a GroundTruth in the same frame.
 
     Returns a dict of floats and ints that JSON can hold; None where a number does not exist: distances of a prediction
@@ -45,7 +51,7 @@ def evaluate(edges, truth):
     return metrics | point_metrics(sample_prediction(edges), truth.points.astype(np.float32))
 
 
-def measure_alone(edges):
+def measure_alone(edges: "EdgeSet") -> dict[str, float | None]:
     """What can be said of `edges`, an EdgeSet in the normalised frame, without a truth; the keys are `evaluate`'s."""
     refuse_unbounded(edges)
     sources = piece_sources(edges)
@@ -59,7 +65,9 @@ def measure_alone(edges):
     }
 
 
-def count_metrics(edges, truth, sources, true):
+def count_metrics(
+    edges: "EdgeSet", truth: "GroundTruth", sources: np.ndarray, true: EdgeGraph | None
+) -> dict[str, float | None]:
     """How many pieces and edges there are. true: the EdgeGraph of the true primitives, or None."""
     count = len(np.unique(sources))
     return {
@@ -72,7 +80,7 @@ def count_metrics(edges, truth, sources, true):
     }
 
 
-def length_metrics(edges, truth, sources):
+def length_metrics(edges: "EdgeSet", truth: "GroundTruth", sources: np.ndarray) -> dict[str, float | None]:
     """Lengths, and how much of them repeats what has been said."""
     length = float(edges.lengths.sum())
     duplicated = duplicated_percent(edges.polylines(), sources)
@@ -91,14 +99,14 @@ def length_metrics(edges, truth, sources):
     return metrics
 
 
-def exact_polylines(edges):
+def exact_polylines(edges: "EdgeSet") -> list[np.ndarray]:
     """One (m, 3) polyline for each piece, lines first, with chords of about STEP: 0.01 mm off at a radius of 3 mm."""
     counts = np.maximum(np.ceil(edges.lengths[len(edges.lines) :] / STEP), FEWEST_CHORDS).astype(int)
     cubics = zip(edges.curves, counts, strict=True)
     return [*edges.lines, *(evaluate_bezier(control, np.linspace(0.0, 1.0, count + 1)) for control, count in cubics)]
 
 
-def true_wireframe(truth):
+def true_wireframe(truth: "GroundTruth") -> EdgeGraph | None:
     """The EdgeGraph of the primitives of a GroundTruth; None where only samples are known."""
     if not truth.curves:
         return None
@@ -106,7 +114,7 @@ def true_wireframe(truth):
     return edge_graph(primitives, np.arange(len(primitives)))
 
 
-def refuse_unbounded(edges):
+def refuse_unbounded(edges: "EdgeSet") -> None:
     """UserError for an edge with a coordinate that is not finite: no distance to it exists."""
     finite = [np.isfinite(part).all(axis=(1, 2)) for part in (edges.lines, edges.curves)]
     for name, good in zip(("line", "curve"), finite, strict=True):
@@ -114,7 +122,7 @@ def refuse_unbounded(edges):
             raise UserError(f"{name} {int(np.argmin(good))}: its points are not finite numbers; drop it before scoring")
 
 
-def piece_sources(edges):
+def piece_sources(edges: "EdgeSet") -> np.ndarray:
     """(L + C,) the source of every piece, lines first; a piece without one (-1) becomes a source of its own."""
     sources = np.concatenate([edges.line_sources, edges.curve_sources]).astype(np.int64)
     alone = sources < 0
@@ -125,7 +133,7 @@ def piece_sources(edges):
 # ------------------------------------------------------------------------------------------------- EMAP's metrics
 
 
-def sample_prediction(edges):
+def sample_prediction(edges: "EdgeSet") -> np.ndarray:
     """EMAP's points of a prediction: (n, 3) float32, one for each voxel that an edge passes through.
 
     An edge shorter than SAMPLE_SPACING gets no point. Outside [-1, 1]^3 the grid simply goes on, as it does in the
@@ -142,7 +150,7 @@ def sample_prediction(edges):
     return average_per_voxel(np.concatenate(samples).astype(np.float32))
 
 
-def average_per_voxel(points, per_unit=VOXELS_PER_UNIT):
+def average_per_voxel(points: np.ndarray, per_unit: int = VOXELS_PER_UNIT) -> np.ndarray:
     """(n, 3) float32 -> (m, 3) float32, the mean of the points of each voxel, `per_unit` on a unit, that has any."""
     if not len(points):
         return points
@@ -152,7 +160,7 @@ def average_per_voxel(points, per_unit=VOXELS_PER_UNIT):
     return (np.stack(sums, axis=1) / counts[:, None]).astype(np.float32)
 
 
-def point_metrics(predicted, true):
+def point_metrics(predicted: np.ndarray, true: np.ndarray) -> dict[str, float | None]:
     """Distances and shares between (p, 3) predicted and (t, 3) true points, both float32."""
     to_true, to_predicted = nearest_distances(predicted, true), nearest_distances(true, predicted)
     metrics = {
@@ -169,7 +177,7 @@ def point_metrics(predicted, true):
     return metrics
 
 
-def nearest_distances(points, others):
+def nearest_distances(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     """(n,) float32 distances from each of the points to the nearest of the others; infinite where there is none."""
     if not len(others):
         return np.full(len(points), np.inf, dtype=np.float32)
@@ -178,7 +186,7 @@ def nearest_distances(points, others):
     return cKDTree(others).query(points)[0].astype(np.float32)
 
 
-def share_nearer_percent(distances, threshold_mm):
+def share_nearer_percent(distances: np.ndarray, threshold_mm: float) -> float:
     """Percent of the float32 distances strictly below the threshold; compared in float32, as EMAP does."""
     if not len(distances):
         return 0.0
@@ -188,7 +196,7 @@ def share_nearer_percent(distances, threshold_mm):
 # ---------------------------------------------------------------------------------------------------- for printing
 
 
-def metrics_rows(metrics):
+def metrics_rows(metrics: Mapping[str, float | None]) -> list[tuple[str, str]]:
     """The dict of `evaluate` as rows (label, value with unit) for printing."""
     metrics = defaultdict(lambda: None, metrics)  # a run that an earlier version has scored lacks some
     true_length = number_text(metrics["true_length_units"])
@@ -217,7 +225,7 @@ def metrics_rows(metrics):
     return rows + held_out_rows(metrics)
 
 
-def rows_alone(metrics):
+def rows_alone(metrics: Mapping[str, float | None]) -> list[tuple[str, str]]:
     """The dict of `measure_alone` as rows (label, value with unit) for printing."""
     metrics = defaultdict(lambda: None, metrics)  # a run that an earlier version has measured lacks some
     return [
@@ -231,7 +239,7 @@ def rows_alone(metrics):
     ]
 
 
-def held_out_rows(metrics):
+def held_out_rows(metrics: Mapping[str, float | None]) -> list[tuple[str, str]]:
     """What the held-out views say (`held_out.held_out_metrics`) as rows; none where there are none."""
     if not metrics["held_out_views"]:
         return []
@@ -246,19 +254,19 @@ def held_out_rows(metrics):
     ]
 
 
-def number_text(value, pattern="{:.2f}"):
+def number_text(value: float | None, pattern: str = "{:.2f}") -> str:
     """The value in the pattern, or 'unknown' for None."""
     return "unknown" if value is None else pattern.format(value)
 
 
-def joints_text(metrics, name):
+def joints_text(metrics: Mapping[str, float | None], name: str) -> str:
     """'10 of 12 (reached: 91.7 %)', 'none in the truth' or 'unknown'."""
     if not metrics[name]:
         return "unknown" if metrics[name] is None else "none in the truth"
     return f"{metrics[f'{name}_closed']} of {metrics[name]} (reached: {metrics[f'{name}_reached_percent']:.1f} %)"
 
 
-def free_ends_text(metrics):
+def free_ends_text(metrics: Mapping[str, float | None]) -> str:
     """'14 (6 at corners, 3 at no true end)', only the number where the true curves are unknown."""
     if metrics["false_free_ends"] is None:
         return number_text(metrics["free_ends"], "{:d}")
@@ -266,7 +274,7 @@ def free_ends_text(metrics):
     return f"{metrics['free_ends']} ({places})"
 
 
-def spread_text(metrics, keys):
+def spread_text(metrics: Mapping[str, float | None], keys: Sequence[str]) -> str:
     """'0.31 mm mean, 0.22 mm median, 0.95 mm p95', of those of the keys, in their units; 'unknown' where they are."""
     if metrics[keys[0]] is None:
         return "unknown"

@@ -9,6 +9,8 @@ A polyline of the file has vertices on its curve, up to 17 mm apart, so its chor
 cubic spline through the vertices misses a circle of radius r with one every h by 0.013 h^4 / r^3: 0.1 micrometres.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from taichi_edges.evaluation.dense_curves import STEP
@@ -21,7 +23,7 @@ SHAPE_TOLERANCE = 3e-4  # of the radius, or the length if less: a cubic of 90 de
 CHORD_ERROR = 1e-5  # normalised units: polylines that miss their curve by less stay as they are
 
 
-def true_primitives(curves, kinds):
+def true_primitives(curves: Sequence[np.ndarray], kinds: Sequence[str]) -> list[np.ndarray]:
     """The curves and kinds of a GroundTruth -> list of (m, 3) polylines, one for each primitive, as good as exact."""
     shapes = [shape_of(curve, kind) for curve, kind in zip(curves, kinds, strict=True)]
     same = [
@@ -37,7 +39,7 @@ def true_primitives(curves, kinds):
     return [refined(curve, kind) for curve, kind in close_ellipses(joined)]
 
 
-def length_of(polyline):
+def length_of(polyline: np.ndarray) -> float:
     """(m, 3) polyline -> its length."""
     return float(np.linalg.norm(np.diff(polyline, axis=0), axis=1).sum())
 
@@ -45,7 +47,7 @@ def length_of(polyline):
 # --------------------------------------------------------------------------------------------------------- shapes
 
 
-def shape_of(polyline, kind):
+def shape_of(polyline: np.ndarray, kind: str) -> str:
     """'line', 'circle' or 'free': by the vertices, except that what the file calls a line is no circle."""
     length = length_of(polyline)
     if fits_line(polyline, length):
@@ -53,7 +55,7 @@ def shape_of(polyline, kind):
     return "circle" if kind != "line" and fits_circle(polyline, length) else "free"
 
 
-def fits_line(points, length):
+def fits_line(points: np.ndarray, length: float) -> bool:
     """Do the (m, 3) points lie on one straight line, to SHAPE_TOLERANCE of the length?"""
     centred = points - points.mean(axis=0)
     direction = np.linalg.svd(centred, full_matrices=False)[2][0]
@@ -61,7 +63,7 @@ def fits_line(points, length):
     return bool(off.max() <= SHAPE_TOLERANCE * length)
 
 
-def fits_circle(points, length):
+def fits_circle(points: np.ndarray, length: float) -> bool:
     """Do the (m, 3) points lie on one circle, to SHAPE_TOLERANCE of its radius or the length, whichever is less?"""
     flat, height = in_their_plane(points)
     # |p|^2 = 2 c.p + (r^2 - |c|^2) is linear in the centre c and the bracket: exact for points on a circle.
@@ -72,7 +74,7 @@ def fits_circle(points, length):
     return bool(max(off.max(), height.max()) <= SHAPE_TOLERANCE * min(radius, length))
 
 
-def fits_ellipse(points, length):
+def fits_ellipse(points: np.ndarray, length: float) -> bool:
     """Do the (m, 3) points of a closed curve lie on one ellipse, to SHAPE_TOLERANCE of a sixth of its length?"""
     flat, height = in_their_plane(points)
     scale = length / 6.0  # the radius of a circle of that length
@@ -84,7 +86,7 @@ def fits_ellipse(points, length):
     return bool(4 * a * c > b * b and max(off.max(), height.max() / scale) <= SHAPE_TOLERANCE)
 
 
-def in_their_plane(points):
+def in_their_plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(m, 3) points -> (m, 2) coordinates in the plane that fits them best, and (m,) distances from it."""
     centred = points - points.mean(axis=0)
     axes = np.linalg.svd(centred, full_matrices=False)[2]
@@ -94,7 +96,7 @@ def in_their_plane(points):
 FITS = {"line": fits_line, "circle": fits_circle}
 
 
-def fit_one(shape, one, other):
+def fit_one(shape: str, one: np.ndarray, other: np.ndarray) -> bool:
     """Do two (m, 3) polylines lie on one and the same line or circle?"""
     return FITS[shape](np.concatenate([one, other]), min(length_of(one), length_of(other)))
 
@@ -102,7 +104,7 @@ def fit_one(shape, one, other):
 # ------------------------------------------------------------------------------------------- pieces put together
 
 
-def touching_pieces(curves):
+def touching_pieces(curves: Sequence[np.ndarray]) -> list[tuple[int, int]]:
     """Sorted list of pairs of curves, the first number the lower, that share an end."""
     from scipy.spatial import cKDTree
 
@@ -113,7 +115,7 @@ def touching_pieces(curves):
     return sorted({(int(min(pair)), int(max(pair))) for pair in pairs if pair[0] != pair[1]})
 
 
-def grouped(count, pairs):
+def grouped(count: int, pairs: Sequence[Sequence[int]]) -> list[list[int]]:
     """Lists of the numbers 0..count-1 that the pairs connect, in the order of their first ones."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -126,7 +128,7 @@ def grouped(count, pairs):
     return sorted(([int(index) for index in group] for group in groups), key=min)
 
 
-def chains(pieces):
+def chains(pieces: Sequence[np.ndarray]) -> list[np.ndarray]:
     """List of (m, 3) polylines that touch end to end -> as few polylines as they make, pieces turned where needed."""
     left, made = list(pieces), []
     while left:
@@ -139,7 +141,7 @@ def chains(pieces):
     return made
 
 
-def next_piece(chain, left):
+def next_piece(chain: np.ndarray, left: list[np.ndarray]) -> np.ndarray | None:
     """Takes the piece that starts where the open chain ends out of `left`, turned if needed; None without one."""
     if touch(chain[0], chain[-1]):
         return None
@@ -151,12 +153,12 @@ def next_piece(chain, left):
     return None
 
 
-def touch(one, other):
+def touch(one: np.ndarray, other: np.ndarray) -> bool:
     """Are the two points one vertex?"""
     return bool(np.linalg.norm(one - other) <= JOINED)
 
 
-def close_ellipses(primitives):
+def close_ellipses(primitives: Sequence[tuple[np.ndarray, str, str]]) -> list[tuple[np.ndarray, str]]:
     """List of (polyline, kind, shape) -> list of (polyline, kind), the pieces of every closed ellipse put together."""
     curves = [curve for curve, _, _ in primitives]
     free = [shape == "free" and kind != "line" for _, kind, shape in primitives]
@@ -176,7 +178,7 @@ def close_ellipses(primitives):
     return result
 
 
-def continue_smoothly(one, other):
+def continue_smoothly(one: np.ndarray, other: np.ndarray) -> bool:
     """Does one of the (m, 3) polylines go on where the other ends, at some end that they share?"""
     for a in (one, one[::-1]):
         for b in (other, other[::-1]):
@@ -190,7 +192,7 @@ def continue_smoothly(one, other):
 # ------------------------------------------------------------------------------------------------------- exactness
 
 
-def refined(polyline, kind):
+def refined(polyline: np.ndarray, kind: str) -> np.ndarray:
     """(m, 3) vertices of a smooth curve -> (n, 3) vertices on it so dense that the chords are as good as the curve."""
     steps = np.linalg.norm(np.diff(polyline, axis=0), axis=1)
     polyline = polyline[np.concatenate([[True], steps > 0])]
@@ -206,7 +208,7 @@ def refined(polyline, kind):
     return spline(np.linspace(0.0, arc[-1], int(np.ceil(arc[-1] / STEP)) + 1))
 
 
-def chord_error(polyline):
+def chord_error(polyline: np.ndarray) -> float:
     """How far the chords of an (m, 3) polyline miss a smooth curve through its vertices: length times turn / 8."""
     chords = np.diff(polyline, axis=0)
     lengths = np.linalg.norm(chords, axis=1)

@@ -1,8 +1,13 @@
 """Polylines as cameras see them: sampled evenly in one image, and at places that several can be asked about."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from taichi_edges.views.cameras import Camera
 
 
 @dataclass(frozen=True)
@@ -19,7 +24,7 @@ class Chords:
     travelled: np.ndarray
 
     @staticmethod
-    def of(polylines):
+    def of(polylines: Sequence[np.ndarray]) -> "Chords":
         """Of a list of (m, 3) polylines; chords of no length are left out."""
         starts = np.concatenate([np.zeros((0, 3)), *(polyline[:-1] for polyline in polylines)])
         ends = np.concatenate([np.zeros((0, 3)), *(polyline[1:] for polyline in polylines)])
@@ -28,10 +33,10 @@ class Chords:
         some = lengths > 0
         return Chords(starts[some], ends[some], owners[some], np.concatenate([[0.0], np.cumsum(lengths[some])]))
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.starts)
 
-    def places(self, spacing):
+    def places(self, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The middles of equal stretches of about `spacing` along each polyline, one for each at least.
 
         Returns points (n, 3), unit tangents (n, 3), and (n,) the length travelled where each stretch ends.
@@ -48,7 +53,7 @@ class Chords:
         vectors = (self.ends - self.starts)[chord] / lengths[:, None]
         return self.starts[chord] + (middles - self.travelled[chord])[:, None] * vectors, vectors, ends
 
-    def in_image(self, camera, spacing):
+    def in_image(self, camera: "Camera", spacing: float) -> "Traces":
         """Traces of the chords in an image, sampled at most `spacing` px apart. camera: Camera."""
         one, other = (camera.homogeneous(points) for points in (self.starts, self.ends))
         low, high = _inside(camera.planes @ one.T, camera.planes @ other.T)
@@ -82,11 +87,11 @@ class Traces:
     lengths: np.ndarray
     travelled: np.ndarray
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.pixels)
 
 
-def _inside(begin, end):
+def _inside(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(c,) shares between which segments are on the right side of all planes; where low >= high they nowhere are.
 
     begin, end: (p, c) signed distances of their ends from the planes.

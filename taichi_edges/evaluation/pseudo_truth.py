@@ -8,14 +8,19 @@ The flaws that the paper names remain. The points lie within a band about each e
 and edges that the maps do not show in most of the views that see them have none.
 """
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from taichi_edges.errors import UserError
 from taichi_edges.evaluation.ground_truth import GroundTruth
 from taichi_edges.evaluation.metrics import average_per_voxel
-from taichi_edges.views.cameras import NEAR
+from taichi_edges.views.cameras import NEAR, Camera
+
+if TYPE_CHECKING:
+    from taichi_edges.scene.settings import ScanConfig
 
 VOXELS_PER_UNIT = 256  # EMAP: 256 voxels over [-1, 1] on each axis, of a frame in which a scene is two units long
 CELL_PX = 2  # side of the cells of a depth buffer, at least; doubled until it has no holes, that is until
@@ -34,7 +39,13 @@ class Votes:
     on_edge: np.ndarray
 
     @staticmethod
-    def of(points, cameras, edge_maps, threshold, report=lambda done: None):
+    def of(
+        points: np.ndarray,
+        cameras: Iterable[Camera],
+        edge_maps: Iterable[np.ndarray],
+        threshold: float,
+        report: Callable[[int], None] = lambda done: None,
+    ) -> "Votes":
         """Of (n, 3) points in the unit cube. cameras: list of Camera. edge_maps: as many (H, W) uint8.
 
         threshold: of full scale, that an edge pixel exceeds. report: called with the number of views that are done.
@@ -48,12 +59,12 @@ class Votes:
             report(view + 1)
         return Votes(seen, on_edge)
 
-    def chosen(self, share, views):
+    def chosen(self, share: float, views: int) -> np.ndarray:
         """(n,) bool: on an edge in more than this share of the views that see it, which are at least so many."""
         return (self.seen >= views) & (self.on_edge > share * self.seen)
 
 
-def pseudo_truth(points, votes, config, name):
+def pseudo_truth(points: np.ndarray, votes: Votes, config: "ScanConfig", name: str) -> GroundTruth:
     """The GroundTruth of (n, 3) points of a scan, unit cube, and the Votes for them. config: `evaluation.scan`.
 
     name: of the scan, for messages.
@@ -69,7 +80,7 @@ def pseudo_truth(points, votes, config, name):
     return GroundTruth(averaged, (), (), None, source)
 
 
-def points_in_box(points, box, name):
+def points_in_box(points: np.ndarray, box: np.ndarray, name: str) -> np.ndarray:
     """Those of the (n, 3) points that lie in the (2, 3) box; UserError where none does. name: of their file."""
     inside = ((points >= box[0]) & (points <= box[1])).all(axis=1)
     if not inside.any():
@@ -79,7 +90,7 @@ def points_in_box(points, box, name):
     return points[inside]
 
 
-def _in_sight(points, camera):
+def _in_sight(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, ...]:
     """Indices of the (n, 3) points that the image has, and rows and columns of their pixels (int32), depths (float32).
 
     A chunk at a time: of millions of points, those in float64 would be the most of the memory.
@@ -98,7 +109,7 @@ def _in_sight(points, camera):
     return tuple(np.concatenate(part) for part in zip(*found, strict=True))
 
 
-def _front_most(rows, columns, depths, camera):
+def _front_most(rows: np.ndarray, columns: np.ndarray, depths: np.ndarray, camera: Camera) -> np.ndarray:
     """(n,) bool: which points no other point of the scan hides, by a depth buffer of cells without holes."""
     side = CELL_PX
     while True:

@@ -5,6 +5,10 @@ name and a value. Numbers are those of the input's frame, which has no unit, and
 """
 
 import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,13 +17,22 @@ from taichi_edges.exporters.nurbs import DEGREE, joined
 from taichi_edges.exporters.palette import KIND_COLOURS
 from taichi_edges.files.artefacts import replacing
 
+if TYPE_CHECKING:
+    from ezdxf.document import Drawing
+    from ezdxf.entities import DXFGraphic
+    from ezdxf.layouts import Modelspace
+    from ezdxf.math import Vec3
+
+    from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
+    from taichi_edges.geometry.wireframe import Edge, Wireframe
+
 VERSION = "R2010"  # the oldest that all programs of today read with true colours
 APPLICATION = "TAICHI_EDGES"
 TEXT, REAL, INTEGER = 1000, 1040, 1071  # group codes of extended data
 VIEW_HEIGHT = 1.2  # of the longest side of the edges' box: what is in sight when the file is opened
 
 
-def write_dxf(path, wireframe):
+def write_dxf(path: Path | str, wireframe: "Wireframe") -> Path:
     """Write the edges of a Wireframe, in the frame the file shall have, as a DXF."""
     refuse_empty(path, wireframe)
     with _fixed_dates() as ezdxf, replacing(path) as unfinished:
@@ -34,16 +47,16 @@ def write_dxf(path, wireframe):
         _look_at(document, wireframe)
         _declare_classes(document)
         document.saveas(unfinished)
-    return path
+    return Path(path)
 
 
-def layer_of(kind):
+def layer_of(kind: str) -> str:
     """'ELLIPTIC_ARCS'."""
     return f"{kind.upper()}S"
 
 
 @contextlib.contextmanager
-def _fixed_dates():
+def _fixed_dates() -> Iterator[ModuleType]:
     """The module ezdxf, told to write no dates and no random identifiers: the same edges give the same bytes."""
     import ezdxf
 
@@ -55,15 +68,20 @@ def _fixed_dates():
         ezdxf.options.write_fixed_meta_data_for_testing = before
 
 
-def _declare_classes(document):
+def _declare_classes(document: "Drawing") -> None:
     """By the alphabet; ezdxf itself takes the order of a set, which differs from process to process."""
     for name in sorted(document.entitydb.dxf_types_in_use()):
         document.classes.add_class(name)
 
 
-def _extended_data(number, edge):
+def _extended_data(number: int, edge: "Edge") -> list[tuple[int, str | float]]:
     """(group code, value) pairs."""
-    pairs = [(TEXT, "edge"), (INTEGER, number), (TEXT, "name"), (TEXT, edge_name(number, edge))]
+    pairs: list[tuple[int, str | float]] = [
+        (TEXT, "edge"),
+        (INTEGER, number),
+        (TEXT, "name"),
+        (TEXT, edge_name(number, edge)),
+    ]
     if edge.evidence:
         for name in ("confidence", "residual_px", "supported_length"):
             pairs += [(TEXT, name), (REAL, float(getattr(edge.evidence, name)))]
@@ -71,30 +89,30 @@ def _extended_data(number, edge):
     return pairs
 
 
-def _look_at(document, wireframe):
+def _look_at(document: "Drawing", wireframe: "Wireframe") -> None:
     """Programs open the file with the edges in sight."""
     points = np.concatenate([shape.cubics().reshape(-1, 3) for shape in wireframe.shapes])
     low, high = points.min(axis=0), points.max(axis=0)
     document.set_modelspace_vport(VIEW_HEIGHT * (high - low).max(), tuple((0.5 * (low + high))[:2].tolist()))
 
 
-def _add_line(space, line):
+def _add_line(space: "Modelspace", line: "Line") -> "DXFGraphic":
     return space.add_line(*line.points.tolist())
 
 
-def _add_circle(space, circle):
+def _add_circle(space: "Modelspace", circle: "EllipticArc") -> "DXFGraphic":
     centre, _ = _in_plane(circle)
     return space.add_circle(centre, circle.radii.mean(), {"extrusion": circle.normal})
 
 
-def _add_arc(space, arc):
+def _add_arc(space: "Modelspace", arc: "EllipticArc") -> "DXFGraphic":
     """Counter-clockwise about its normal, as our angles are."""
     centre, start = _in_plane(arc)
-    angles = start + np.degrees([0.0, arc.high - arc.low])
-    return space.add_arc(centre, arc.radii.mean(), *(angles % 360.0), dxfattribs={"extrusion": arc.normal})
+    low, high = (start + np.degrees([0.0, arc.high - arc.low])) % 360.0
+    return space.add_arc(centre, arc.radii.mean(), low, high, dxfattribs={"extrusion": arc.normal})
 
 
-def _in_plane(arc):
+def _in_plane(arc: "EllipticArc") -> tuple["Vec3", float]:
     """Its centre in the coordinate system that DXF derives from the normal, and where it starts there, degrees."""
     from ezdxf.math import OCS
 
@@ -103,19 +121,19 @@ def _in_plane(arc):
     return system.from_wcs(arc.centre), np.degrees(np.arctan2(towards.y, towards.x))
 
 
-def _add_ellipse(space, arc):
+def _add_ellipse(space: "Modelspace", arc: "EllipticArc") -> "DXFGraphic":
     low, high = (0.0, 2 * np.pi) if arc.closed else (arc.low, arc.high)
     ratio = arc.radii[1] / arc.radii[0]
     return space.add_ellipse(arc.centre, arc.axes[0], ratio, low, high, {"extrusion": arc.normal})
 
 
-def _add_spline(space, spline):
+def _add_spline(space: "Modelspace", spline: "Spline") -> "DXFGraphic":
     """Without the flag of closed splines: some programs then make up knots of their own."""
     same = joined(spline.curves)
     return space.add_open_spline(same.control_points, DEGREE, same.all_knots.tolist())
 
 
-ENTITIES = {
+ENTITIES: dict[str, Callable[..., "DXFGraphic"]] = {
     "line": _add_line,
     "circle": _add_circle,
     "arc": _add_arc,

@@ -1,5 +1,8 @@
 """Edges as line sets: PLY (Open3D, CloudCompare, MeshLab) and OBJ (Blender and most CAD programs)."""
 
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from taichi_edges.exporters.naming import confidence_of, edge_name, evidence_words, refuse_empty
@@ -8,10 +11,15 @@ from taichi_edges.files.artefacts import write_text
 from taichi_edges.files.ply import write_elements
 from taichi_edges.geometry.shapes import polyline
 
+if TYPE_CHECKING:
+    import open3d as o3d
+
+    from taichi_edges.geometry.wireframe import Wireframe
+
 CURVE_SEGMENTS = 32  # for each cubic: a quarter circle in so many chords is off by 0.03 % of its radius
 
 
-def edge_paths(wireframe):
+def edge_paths(wireframe: "Wireframe") -> tuple[np.ndarray, list[np.ndarray]]:
     """The edges of a Wireframe as paths over one list of points.
 
     Returns points (n, 3) float64, the wireframe's vertices first, and for each edge the (k,) int64 indices of the
@@ -29,7 +37,7 @@ def edge_paths(wireframe):
     return np.concatenate(points), paths
 
 
-def line_set_arrays(wireframe):
+def line_set_arrays(wireframe: "Wireframe") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The edges of a Wireframe as one indexed line set.
 
     Returns points (n, 3) float64, segments (m, 2) int32 into them, and (m,) the edge of each segment.
@@ -40,7 +48,7 @@ def line_set_arrays(wireframe):
     return points, np.concatenate([np.zeros((0, 2)), *segments]).astype(np.int32), owners
 
 
-def build_line_set(wireframe):
+def build_line_set(wireframe: "Wireframe") -> "o3d.geometry.LineSet":
     """A Wireframe as an open3d.geometry.LineSet, one colour per edge."""
     import open3d as o3d
 
@@ -50,7 +58,7 @@ def build_line_set(wireframe):
     return line_set
 
 
-def write_line_set_ply(path, wireframe):
+def write_line_set_ply(path: Path | str, wireframe: "Wireframe") -> Path:
     """Write a binary PLY: points as doubles, segments as vertex1, vertex2, red, green, blue and two of our own.
 
     These are `edge`, the index in `edges.json`, and `confidence`, NaN where it is unknown; readers skip properties
@@ -69,7 +77,7 @@ def write_line_set_ply(path, wireframe):
     return write_elements(path, {"vertex": vertices, "edge": segments})
 
 
-def write_line_set_obj(path, wireframe):
+def write_line_set_obj(path: Path | str, wireframe: "Wireframe") -> Path:
     """Write a Wavefront OBJ: one object `line_3` or `arc_0` with one `l` polyline per edge, numbers in full.
 
     wireframe: in the frame the file shall have.
@@ -86,10 +94,9 @@ def write_line_set_obj(path, wireframe):
         text += _vertex_lines(points[written:upto])
         text.append("l " + " ".join(map(str, along + 1)))  # OBJ counts vertices from 1
         written = upto
-    write_text(path, "\n".join(text) + "\n")
-    return path
+    return write_text(path, "\n".join(text) + "\n")
 
 
-def _vertex_lines(points):
+def _vertex_lines(points: np.ndarray) -> list[str]:
     """'v 0.1 0.2 0.3' of each of the (n, 3) points."""
     return ["v " + " ".join(map(repr, point)) for point in points.tolist()]

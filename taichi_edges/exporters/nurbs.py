@@ -20,12 +20,12 @@ class BSpline:
     multiplicities: np.ndarray
 
     @property
-    def all_knots(self):
+    def all_knots(self) -> np.ndarray:
         """(m + 4,) every knot as often as it counts."""
         return np.repeat(self.knots, self.multiplicities)
 
 
-def joined(curves):
+def joined(curves: np.ndarray) -> BSpline:
     """The BSpline of a chain of cubics, (c, 4, 3).
 
     With a triple knot at a joint any two cubics are one spline, but many kernels cut a curve there, or refuse it, since
@@ -34,7 +34,7 @@ def joined(curves):
     """
     spans, multiplicities, control = [1.0], [DEGREE + 1], [curves[0, 0], curves[0, 1]]
     for before, after in zip(curves[:-1], curves[1:], strict=True):
-        into, out = np.linalg.norm(before[3] - before[2]), np.linalg.norm(after[1] - after[0])
+        into, out = (float(np.linalg.norm(handle)) for handle in (before[3] - before[2], after[1] - after[0]))
         smooth = _is_smooth(before[2], before[3], after[1], into, out)
         spans.append(spans[-1] * (out / into if smooth else 1.0))
         multiplicities.append(DEGREE - smooth)
@@ -44,7 +44,7 @@ def joined(curves):
     return BSpline(np.array(control), knots / knots[-1], np.array([*multiplicities, DEGREE + 1]))
 
 
-def _is_smooth(before, joint, after, into, out):
+def _is_smooth(before: np.ndarray, joint: np.ndarray, after: np.ndarray, into: float, out: float) -> bool:
     """Does the joint lie between its neighbours, (3,) each, `into` and `out` away from it, as a smooth curve's does?"""
     if min(into, out) <= SMOOTH * max(into, out):
         return False

@@ -1,7 +1,9 @@
 """PNG pictures of the edges drawn over the views, for people to judge the result by eye."""
 
 import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -13,7 +15,10 @@ from taichi_edges.exporters.palette import CURVE_COLOUR, LINE_COLOUR
 from taichi_edges.files.artefacts import replacing
 from taichi_edges.views.cameras import NEAR
 from taichi_edges.views.pictures import SAME_SHAPE, read_colour
-from taichi_edges.views.views import choose_views
+from taichi_edges.views.views import Views, choose_views
+
+if TYPE_CHECKING:
+    from taichi_edges.geometry.wireframe import Wireframe
 
 OVERSAMPLING = 4  # the edges are drawn so many times larger and averaged
 SUBPIXEL_BITS = 4  # OpenCV draws in units of 1/16 pixel
@@ -33,8 +38,10 @@ SHEET_GAP = 8  # pixels
 TEXT_COLOUR = (40, 40, 40)
 GREYS = np.arange(256)
 
+Symbol = Callable[[np.ndarray, np.ndarray, float], None]  # draws on a picture, between two pixels (2, 2), with a stroke
 
-def draw_overlays(folder, views, wireframe, count=4):
+
+def draw_overlays(folder: Path | str, views: Views, wireframe: "Wireframe", count: int = 4) -> list[Path]:
     """Draw the edges of a wireframe over `count` views that look in different directions, one PNG each.
 
     Over the view's colour image where there is a readable one, else over its edge map, faded. Hidden edges are drawn
@@ -51,12 +58,14 @@ def draw_overlays(folder, views, wireframe, count=4):
     return paths
 
 
-def contact_sheet(paths, out):
+def contact_sheet(paths: Sequence[Path | str], out: Path | str) -> Path:
     """Put pictures (paths, at least one, all of one size) side by side into one PNG, `out`, row by row."""
-    pictures = [read_colour(path) for path in paths]
-    for path, picture in zip(paths, pictures, strict=True):
+    pictures = []
+    for path in paths:
+        picture = read_colour(path)
         if picture is None:
             raise UserError(f"{path}: not a readable picture; run the export again")
+        pictures.append(picture)
     columns = int(np.ceil(np.sqrt(len(pictures))))
     rows = -(-len(pictures) // columns)
     shrink = min(1.0, SHEET_WIDTH / (columns * pictures[0].shape[1]))
@@ -71,7 +80,7 @@ def contact_sheet(paths, out):
     return Path(out)
 
 
-def background(views, view):
+def background(views: Views, view: int) -> np.ndarray:
     """What is drawn on: (H, W, 3) uint8 BGR, the colour image of the view or its edge map, mixed with white."""
     colour = read_colour(views.image_paths[view]) if views.image_paths[view] else None
     if colour is not None:
@@ -83,7 +92,7 @@ def background(views, view):
     return np.repeat(faded[:, :, None], 3, axis=2)
 
 
-def draw_edges(picture, projection, wireframe):
+def draw_edges(picture: np.ndarray, projection: np.ndarray, wireframe: "Wireframe") -> np.ndarray:
     """Draw anti-aliased edges and their vertices on a (H, W, 3) uint8 BGR picture, in place; returns it.
 
     The less confidence in an edge, the fainter it is. A vertex where edges meet is a dark dot, a free end an open ring.
@@ -107,39 +116,40 @@ def draw_edges(picture, projection, wireframe):
     return picture
 
 
-def _thinness(count):
+def _thinness(count: int) -> float:
     """Factor on the strokes: where there are many edges they would hide each other."""
     return max(THINNEST, min(1.0, (MANY_EDGES / max(count, 1)) ** 0.5))
 
 
-def _pixels(homogeneous):
+def _pixels(homogeneous: np.ndarray) -> np.ndarray:
     """(..., 3) homogeneous pixels, all in front of the camera -> (..., 2)."""
     return homogeneous[..., :2] / homogeneous[..., 2:]
 
 
-def _opacities(wireframe):
+def _opacities(wireframe: "Wireframe") -> np.ndarray:
     """(n,) FAINTEST to 1, by confidence, in steps of 0.05; an edge that nobody has judged is opaque."""
     confidences = np.nan_to_num(np.array([confidence_of(edge) for edge in wireframe.edges], dtype=float), nan=1.0)
     return np.round(20 * (FAINTEST + (1 - FAINTEST) * np.clip(confidences, 0, 1))) / 20
 
 
-def _are_lines(wireframe):
+def _are_lines(wireframe: "Wireframe") -> np.ndarray:
     """(n,) bool."""
     return np.array([shape.kind == "line" for shape in wireframe.shapes], dtype=bool)
 
 
-def _mark(picture, pixels, stroke, ring):
+def _mark(picture: np.ndarray, pixels: np.ndarray, stroke: float, ring: bool) -> None:
     """Draw vertices at the (n, 2) pixels: dots, or white discs with a dark outline."""
     if not ring:
-        return _paint(picture, DOT_COLOUR, DOT_WIDTH * stroke, [(1.0, np.repeat(pixels[:, None], 2, axis=1))])
+        _paint(picture, DOT_COLOUR, DOT_WIDTH * stroke, [(1.0, np.repeat(pixels[:, None], 2, axis=1))])
+        return
     _paint(picture, RING_COLOUR, RING_WIDTH * stroke, [(1.0, np.repeat(pixels[:, None], 2, axis=1))])
     round_trip = np.linspace(0, 2 * np.pi, RING_SIDES + 1)
     outline = 0.5 * RING_WIDTH * stroke * np.stack([np.cos(round_trip), np.sin(round_trip)], axis=1)
     sides = np.stack([outline[:-1], outline[1:]], axis=1)
-    return _paint(picture, DOT_COLOUR, RING_STROKE * stroke, [(1.0, (pixels[:, None, None] + sides).reshape(-1, 2, 2))])
+    _paint(picture, DOT_COLOUR, RING_STROKE * stroke, [(1.0, (pixels[:, None, None] + sides).reshape(-1, 2, 2))])
 
 
-def frustum_planes(width, height, margin):
+def frustum_planes(width: int, height: int, margin: float) -> np.ndarray:
     """(5, 3) planes: a . (uz, vz, z) >= 0 holds in the visible region. Near (at depth 0), left, right, top, bottom.
 
     margin: pixels around the image that still count, so that no round line cap shows inside it.
@@ -148,7 +158,7 @@ def frustum_planes(width, height, margin):
     return np.array([[0, 0, 1], [1, 0, margin], [-1, 0, right], [0, 1, margin], [0, -1, bottom]], dtype=np.float64)
 
 
-def clip_segments(segments, planes):
+def clip_segments(segments: np.ndarray, planes: np.ndarray) -> np.ndarray:
     """Cut segments to the visible region before the division by depth, so that nothing wraps round behind the camera.
 
     segments: (m, 2, 3) homogeneous pixels (uz, vz, z). planes: (5, 3). Returns the visible parts, (k, 2, 3).
@@ -165,7 +175,7 @@ def clip_segments(segments, planes):
     return segments[kept, :1] * (1.0 - at) + segments[kept, 1:] * at
 
 
-def caption(width, name, wireframe):
+def caption(width: int, name: str, wireframe: "Wireframe") -> np.ndarray:
     """The strip below the picture, (h, width, 3) uint8 BGR: the view's name, below it the legend.
 
     Edges are counted, not their pieces; vertices where edges meet, and free ends, as they are drawn. The height is the
@@ -186,9 +196,12 @@ def caption(width, name, wireframe):
     return strip
 
 
-def _rows(legend, right, letter, scale):
+def _rows(
+    legend: Sequence[tuple[Symbol, str]], right: int, letter: int, scale: float
+) -> list[list[tuple[int, Symbol, str]]]:
     """The legend in as many rows as it needs, which end before the pixel `right`: lists of (left, symbol, words)."""
-    rows, left = [], right
+    rows: list[list[tuple[int, Symbol, str]]] = []
+    left = right
     for symbol, words in legend:
         size = 3 * letter + _size_of(words, scale)[0]
         if left + size > right:
@@ -199,14 +212,14 @@ def _rows(legend, right, letter, scale):
     return rows
 
 
-def _legend(wireframe):
+def _legend(wireframe: "Wireframe") -> list[tuple[Symbol, str]]:
     """What is drawn in the overlays, as (function that draws a sample between two pixels (2, 2), words)."""
     lines, degrees = int(_are_lines(wireframe).sum()), wireframe.degrees
 
-    def stretch(colour, opacity=1.0):
+    def stretch(colour: tuple[int, int, int], opacity: float = 1.0) -> Symbol:
         return lambda strip, ends, stroke: _paint(strip, colour, stroke, [(opacity, ends[None])])
 
-    def mark(ring):
+    def mark(ring: bool) -> Symbol:
         return lambda strip, ends, stroke: _mark(strip, ends.mean(axis=0)[None], stroke, ring)
 
     legend = [
@@ -219,21 +232,23 @@ def _legend(wireframe):
     return [*legend, faint] if (_opacities(wireframe) < 1.0).any() else legend
 
 
-def _size_of(words, scale):
+def _size_of(words: str, scale: float) -> Sequence[int]:
     """(width, height above the baseline) of letters, px."""
     return cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, scale, _thickness(scale))[0]
 
 
-def _thickness(scale):
+def _thickness(scale: float) -> int:
     return max(round(2 * scale), 1)
 
 
-def _write(picture, words, origin, scale):
+def _write(picture: np.ndarray, words: str, origin: tuple[int, int], scale: float) -> None:
     """Letters with their lower left corner at `origin`, (x, y) pixels."""
     cv2.putText(picture, words, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, TEXT_COLOUR, _thickness(scale), cv2.LINE_AA)
 
 
-def _paint(picture, colour, stroke, layers):
+def _paint(
+    picture: np.ndarray, colour: tuple[int, int, int], stroke: float, layers: Sequence[tuple[float, np.ndarray]]
+) -> None:
     """Paint segments `stroke` pixels wide, with round ends; a point becomes a dot.
 
     layers: (opacity, (m, 2, 2) pixels), the later ones on top. Through an oversampled mask: OpenCV's own anti-aliasing
@@ -253,7 +268,7 @@ def _paint(picture, colour, stroke, layers):
     picture[touched] = (picture[touched] * (1.0 - alpha) + np.array(colour[::-1]) * alpha).round()
 
 
-def _write_png(path, picture):
+def _write_png(path: Path | str, picture: np.ndarray) -> None:
     """Write (H, W, 3) uint8 BGR as a PNG, all of it or nothing."""
     written, content = cv2.imencode(".png", picture)
     assert written

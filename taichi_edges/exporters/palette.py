@@ -25,7 +25,7 @@ CLUSTER_COLOURS = np.array(
 )  # fmt: skip
 
 
-def label_colours(labels):
+def label_colours(labels: np.ndarray) -> np.ndarray:
     """(n,) int cluster labels -> (n, 3) uint8 RGB. The colours repeat after len(CLUSTER_COLOURS); -1 is grey."""
     labels = np.asarray(labels, dtype=np.int64).reshape(-1)
     colours = CLUSTER_COLOURS[labels % len(CLUSTER_COLOURS)]

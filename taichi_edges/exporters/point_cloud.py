@@ -1,5 +1,7 @@
 """Oriented points as a PLY: the directions are the normals, the clusters the colours."""
 
+from pathlib import Path
+
 import numpy as np
 
 from taichi_edges.errors import UserError
@@ -11,7 +13,9 @@ POINT_FIELDS = ("x", "y", "z")
 DIRECTION_FIELDS = ("nx", "ny", "nz")
 
 
-def write_oriented_points(path, points, directions, labels=None):
+def write_oriented_points(
+    path: Path | str, points: np.ndarray, directions: np.ndarray, labels: np.ndarray | None = None
+) -> Path:
     """Write a binary PLY with the directions as normals, in float64 if the points or directions are, else in float32.
 
     points: (n, 3) world units. directions: (n, 3). labels: (n,) int cluster of each point, -1 for none; they become
@@ -33,10 +37,10 @@ def write_oriented_points(path, points, directions, labels=None):
     with replacing(path) as unfinished:
         if not o3d.t.io.write_point_cloud(str(unfinished), cloud):
             raise UserError(f"{path}: Open3D could not write it; is the disk full?")
-    return path
+    return Path(path)
 
 
-def read_oriented_points(path):
+def read_oriented_points(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
     """Read what `write_oriented_points` wrote. Returns points (n, 3) and directions (n, 3), float32 or float64."""
     vertices = read_vertices(path, POINT_FIELDS + DIRECTION_FIELDS)
     return stack_fields(vertices, POINT_FIELDS), stack_fields(vertices, DIRECTION_FIELDS)

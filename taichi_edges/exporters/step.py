@@ -10,12 +10,19 @@ metre and a hundred metres large.
 """
 
 import math
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from taichi_edges.exporters.naming import edge_name, evidence_words, refuse_empty
 from taichi_edges.exporters.nurbs import DEGREE, joined
 from taichi_edges.files.artefacts import write_text
+
+if TYPE_CHECKING:
+    from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
+    from taichi_edges.geometry.wireframe import Wireframe
 
 SCHEMA = "AUTOMOTIVE_DESIGN { 1 0 10303 214 1 1 1 1 }"
 NO_DATE = "1970-01-01T00:00:00"  # the same edges give the same bytes
@@ -32,6 +39,8 @@ DATA;
 """
 FOOTER = "ENDSEC;\nEND-ISO-10303-21;\n"
 
+Value = str | float | Iterable  # of an entity: text, a number, or a list of values
+
 
 class Token(str):
     """Text that stands in the file as it is: a reference, an enumeration, a typed value."""
@@ -43,14 +52,14 @@ TRUE, FALSE, UNSPECIFIED, UNSET, DERIVED = (Token(text) for text in (".T.", ".F.
 class Entities:
     """The entities of the file in order; each gets the next number."""
 
-    def __init__(self):
-        self.lines = []
+    def __init__(self) -> None:
+        self.lines: list[str] = []
 
-    def add(self, keyword, *values):
+    def add(self, keyword: str, *values: Value) -> Token:
         """Add an entity; returns the reference to it."""
         return self.add_complex((keyword, *values))
 
-    def add_complex(self, *parts):
+    def add_complex(self, *parts: tuple) -> Token:
         """Add an entity of several types, (keyword, *values) each, in the order of the alphabet."""
         written = "".join(f"{keyword}({','.join(map(encoded, values))})" for keyword, *values in parts)
         reference = Token(f"#{len(self.lines) + 1}")
@@ -58,7 +67,7 @@ class Entities:
         return reference
 
 
-def encoded(value):
+def encoded(value: Value) -> str:
     """A value as Part 21 writes it: 3 -> 3, 3.0 -> 3., 1e-9 -> 1.E-09, "it's" -> 'it''s', (1, 2) -> (1,2)."""
     if isinstance(value, Token):
         return value
@@ -77,7 +86,7 @@ def encoded(value):
     return f"({','.join(map(encoded, value))})"
 
 
-def write_step(path, wireframe):
+def write_step(path: Path | str, wireframe: "Wireframe") -> Path:
     """Write the edges of a Wireframe, in the frame the file shall have, as a STEP file."""
     refuse_empty(path, wireframe)
     entities = Entities()
@@ -92,9 +101,10 @@ def write_step(path, wireframe):
     return write_text(path, HEADER + "\n".join(entities.lines) + "\n" + FOOTER)
 
 
-def connected_parts(wireframe):
+def connected_parts(wireframe: "Wireframe") -> list[list[int]]:
     """The edges that hang together by shared vertices, as lists of their indices, by the first."""
-    first_at, parts = {}, [[number] for number in range(len(wireframe))]
+    first_at: dict[int, int] = {}
+    parts = [[number] for number in range(len(wireframe))]
     for number, edge in enumerate(wireframe.edges):
         for vertex in edge.vertices:
             other = parts[first_at.setdefault(vertex, number)]
@@ -105,18 +115,18 @@ def connected_parts(wireframe):
     return [sorted(part) for number, part in enumerate(parts) if number == min(part)]
 
 
-def prefix_for(size):
+def prefix_for(size: float) -> Token:
     """The prefix of the metre for edges of this size, units of the frame."""
     steps = math.floor(math.log(max(size, 1e-300) / SMALLEST, RANGE))
     return Token(PREFIXES[min(max(PREFIXES.index("$") - steps, 0), len(PREFIXES) - 1)])
 
 
-def _longest_side(wireframe):
+def _longest_side(wireframe: "Wireframe") -> float:
     points = np.concatenate([shape.cubics().reshape(-1, 3) for shape in wireframe.shapes])
     return float(np.ptp(points, axis=0).max())
 
 
-def _add_edges(entities, wireframe):
+def _add_edges(entities: Entities, wireframe: "Wireframe") -> list[Token]:
     """An EDGE_CURVE for each edge; the references in order. A closed one starts and ends in a vertex of its own."""
     used = {vertex for edge in wireframe.edges for vertex in edge.vertices}
     vertices = {vertex: _add_vertex(entities, wireframe.vertices[vertex]) for vertex in sorted(used)}
@@ -132,42 +142,42 @@ def _add_edges(entities, wireframe):
     return references
 
 
-def _add_vertex(entities, point):
+def _add_vertex(entities: Entities, point: np.ndarray) -> Token:
     return entities.add("VERTEX_POINT", "", _add_point(entities, point))
 
 
-def _add_point(entities, point):
+def _add_point(entities: Entities, point: np.ndarray) -> Token:
     return entities.add("CARTESIAN_POINT", "", np.asarray(point).tolist())
 
 
-def _add_direction(entities, direction):
+def _add_direction(entities: Entities, direction: np.ndarray) -> Token:
     return entities.add("DIRECTION", "", (direction / np.linalg.norm(direction)).tolist())
 
 
-def _add_placement(entities, origin, z, x):
+def _add_placement(entities: Entities, origin: np.ndarray, z: np.ndarray, x: np.ndarray) -> Token:
     """A coordinate system: (3,) each."""
     parts = _add_point(entities, origin), _add_direction(entities, z), _add_direction(entities, x)
     return entities.add("AXIS2_PLACEMENT_3D", "", *parts)
 
 
-def _add_line(entities, line):
+def _add_line(entities: Entities, line: "Line") -> Token:
     start, end = line.points
     along = entities.add("VECTOR", "", _add_direction(entities, end - start), line.length)
     return entities.add("LINE", "", _add_point(entities, start), along)
 
 
-def _add_circle(entities, arc):
+def _add_circle(entities: Entities, arc: "EllipticArc") -> Token:
     """Counter-clockwise about its normal, as our angles are: the vertices say where it starts and ends."""
     placement = _add_placement(entities, arc.centre, arc.normal, arc.axes[0])
     return entities.add("CIRCLE", "", placement, float(arc.radii.mean()))
 
 
-def _add_ellipse(entities, arc):
+def _add_ellipse(entities: Entities, arc: "EllipticArc") -> Token:
     placement = _add_placement(entities, arc.centre, arc.normal, arc.axes[0])
     return entities.add("ELLIPSE", "", placement, *arc.radii.tolist())
 
 
-def _add_spline(entities, spline):
+def _add_spline(entities: Entities, spline: "Spline") -> Token:
     same = joined(spline.curves)
     control = [_add_point(entities, point) for point in same.control_points]
     knots = same.multiplicities.tolist(), same.knots.tolist()
@@ -176,7 +186,7 @@ def _add_spline(entities, spline):
     return entities.add("B_SPLINE_CURVE_WITH_KNOTS", *form, *knots, UNSPECIFIED)
 
 
-CURVES = {
+CURVES: dict[str, Callable[..., Token]] = {
     "line": _add_line,
     "circle": _add_circle,
     "arc": _add_circle,
@@ -186,7 +196,7 @@ CURVES = {
 }
 
 
-def _add_context(entities, prefix, uncertainty):
+def _add_context(entities: Entities, prefix: Token, uncertainty: float) -> Token:
     """The context of all geometry: three dimensions, metres with a prefix, radians. uncertainty: in this unit."""
     unit = ("NAMED_UNIT", DERIVED)
     length = entities.add_complex(("LENGTH_UNIT",), unit, ("SI_UNIT", prefix, Token(".METRE.")))
@@ -203,7 +213,7 @@ def _add_context(entities, prefix, uncertainty):
     )
 
 
-def _add_product(entities, shape):
+def _add_product(entities: Entities, shape: Token) -> None:
     """What says that the shape is that of a part: programs start reading here."""
     application = entities.add("APPLICATION_CONTEXT", "core data for automotive mechanical design processes")
     protocol = "international standard", "automotive_design", 2000

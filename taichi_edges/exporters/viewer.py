@@ -4,11 +4,19 @@ import contextlib
 import io
 import os
 import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from taichi_edges.errors import UserError
 from taichi_edges.exporters.line_sets import build_line_set
+
+if TYPE_CHECKING:
+    from open3d.visualization import Visualizer
+
+    from taichi_edges.geometry.wireframe import Wireframe
 
 POINT_COLOUR = (0.55, 0.55, 0.55)
 DIRECTION_COLOUR = (0.78, 0.78, 0.78)  # pale, so that the edges stand out
@@ -17,7 +25,7 @@ VIEW_FROM = (0.6, -0.8, 0.5)  # obliquely from above, for scenes whose z points 
 VIEW_ZOOM = 1.0  # Open3D's own 0.7 cuts off the corners of a cube seen obliquely
 
 
-def build_geometries(points, directions, wireframe):
+def build_geometries(points: np.ndarray, directions: np.ndarray, wireframe: "Wireframe") -> list:
     """What the window shows: a PointCloud, a LineSet of short segments along the directions, a LineSet of the edges.
 
     points: (n, 3) world units. directions: (n, 3) unit vectors. wireframe: Wireframe in the same frame.
@@ -41,12 +49,14 @@ def build_geometries(points, directions, wireframe):
     return geometries
 
 
-def has_display():
+def has_display() -> bool:
     """Whether a window can be opened, as far as that can be told without trying: only Linux tells by a variable."""
     return not sys.platform.startswith("linux") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
 
 
-def show(points, directions, wireframe, written_files):
+def show(
+    points: np.ndarray, directions: np.ndarray, wireframe: "Wireframe", written_files: Iterable[Path | str]
+) -> None:
     """Open a window and return when it is closed.
 
     points, directions, wireframe: as in `build_geometries`. written_files: what to open instead where there is no
@@ -70,7 +80,7 @@ def show(points, directions, wireframe, written_files):
     window.destroy_window()
 
 
-def _open_window(instead):
+def _open_window(instead: str) -> "Visualizer":
     """What draw_geometries opens; but where that only warns, or draws offscreen for ever, this raises.
 
     Open3D from 0.20 on turns to offscreen EGL where a display is named but cannot be reached, and says so only in

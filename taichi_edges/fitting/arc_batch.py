@@ -3,6 +3,7 @@
 Points and the arc each is compared with come as two arrays: points (t, 3) and `of` (t,), the number of the arc.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -26,24 +27,24 @@ class ArcBatch:
     closed: np.ndarray
 
     @staticmethod
-    def of(arcs):
+    def of(arcs: Sequence[Arc]) -> "ArcBatch":
         """From a list of Arcs."""
         vectors = (np.array([getattr(arc, name) for arc in arcs]).reshape(-1, 3) for name in VECTORS)
         return ArcBatch(*vectors, *(np.array([getattr(arc, name) for arc in arcs]) for name in ENDS))
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.low)
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[Arc]:
         """One Arc after the other."""
         rows = zip(*(getattr(self, name) for name in VECTORS), *(getattr(self, name).tolist() for name in ENDS))
         return (Arc(*row) for row in rows)
 
-    def keep(self, chosen):
+    def keep(self, chosen: np.ndarray) -> "ArcBatch":
         """The chosen ones. chosen: (m,) bool or indices."""
         return ArcBatch(*(getattr(self, name)[chosen] for name in VECTORS + ENDS))
 
-    def put(self, numbers, others):
+    def put(self, numbers: np.ndarray, others: "ArcBatch") -> "ArcBatch":
         """The same, those of the given numbers replaced by the ArcBatch `others`."""
         arrays = [getattr(self, name).copy() for name in VECTORS + ENDS]
         for array, name in zip(arrays, VECTORS + ENDS, strict=True):
@@ -51,22 +52,22 @@ class ArcBatch:
         return ArcBatch(*arrays)
 
     @cached_property
-    def curvature(self):
+    def curvature(self) -> np.ndarray:
         """(m,) 1 / radius; 0 for a line."""
         return np.sqrt((self.bend**2).sum(axis=1))
 
     @property
-    def round(self):
+    def round(self) -> np.ndarray:
         """(m,) lengths of the whole circles; infinite for a line."""
         return np.where(self.curvature > FLAT, 2 * np.pi / np.maximum(self.curvature, FLAT), np.inf)
 
     @property
-    def length(self):
+    def length(self) -> np.ndarray:
         """(m,) from `low` to `high`."""
         return self.high - self.low
 
     @cached_property
-    def frame(self):
+    def frame(self) -> np.ndarray:
         """(m, 3, 3) rows: tangent, inward normal (any, of a line) and the normal of the plane, at the origin."""
         aside = crosses(self.tangent, np.eye(3)[np.argmin(np.abs(self.tangent), axis=1)])
         aside /= np.sqrt((aside**2).sum(axis=1, keepdims=True))
@@ -74,7 +75,7 @@ class ArcBatch:
         inward = np.where(bent > FLAT, self.bend / np.maximum(bent, FLAT), aside)
         return np.stack([self.tangent, inward, crosses(self.tangent, inward)], axis=1)
 
-    def coordinates(self, points, of):
+    def coordinates(self, points: np.ndarray, of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(t,) arc lengths of the nearest places, and (t, 2) offsets from these, see `Arc.coordinates`."""
         x, u, w = np.einsum("tij,tj->it", self.frame[of], points - self.origin[of])
         bent = self.curvature[of]
@@ -87,31 +88,31 @@ class ArcBatch:
         along -= np.round(turns) * np.where(curved, self.round[of], 0.0)
         return np.where(curved, along, x), np.stack([np.where(curved, inward, u), w], axis=1)
 
-    def at(self, along, of):
+    def at(self, along: np.ndarray, of: np.ndarray) -> np.ndarray:
         """(t,) arc lengths -> (t, 3) points."""
         bent, frame = self.curvature[of], self.frame[of]
         x, y = sine(along, bent), bent * versine(along, bent)
         return self.origin[of] + x[:, None] * frame[:, 0] + y[:, None] * frame[:, 1]
 
-    def tangents(self, along, of):
+    def tangents(self, along: np.ndarray, of: np.ndarray) -> np.ndarray:
         """(t,) arc lengths -> (t, 3) unit tangents."""
         angle, frame = (along * self.curvature[of])[:, None], self.frame[of]
         return np.cos(angle) * frame[:, 0] + np.sin(angle) * frame[:, 1]
 
-    def recentred(self):
+    def recentred(self) -> "ArcBatch":
         """The same with their origins in their middles."""
         each, middle, half = np.arange(len(self)), 0.5 * (self.low + self.high), 0.5 * self.length
         tangent = self.tangents(middle, each)
         bend = self.curvature[:, None] * crosses(self.frame[:, 2], tangent)
         return ArcBatch(self.at(middle, each), tangent, bend, -half, half, self.closed)
 
-    def over(self, low, high):
+    def over(self, low: np.ndarray, high: np.ndarray) -> "ArcBatch":
         """The same with other ends, (m,) each; closed where these are a round apart."""
         whole = high - low >= self.round * (1 - 1e-9)
         return ArcBatch(self.origin, self.tangent, self.bend, low, np.where(whole, low + self.round, high), whole)
 
     @property
-    def sagitta(self):
+    def sagitta(self) -> np.ndarray:
         """(m,) how far the middles are off the chords; of more than half a circle, the radius at least."""
         bent = self.curvature
         return (1 - np.cos(np.minimum(0.5 * bent * self.length, np.pi))) / np.maximum(bent, 1e-9)
@@ -120,25 +121,34 @@ class ArcBatch:
 VECTORS, ENDS = ("origin", "tangent", "bend"), ("low", "high", "closed")
 
 
-def crosses(a, b):
+def crosses(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Cross products of (m, 3) vectors; np.cross takes several times as long for a few hundred."""
     ahead, behind = [1, 2, 0], [2, 0, 1]
     return a[:, ahead] * b[:, behind] - a[:, behind] * b[:, ahead]
 
 
-def sine(along, bent):
+def sine(along: np.ndarray, bent: np.ndarray) -> np.ndarray:
     """sin(bent s) / bent, which tends to s."""
     curved = bent > FLAT
     return np.where(curved, np.sin(bent * along) / np.where(curved, bent, 1.0), along)
 
 
-def versine(along, bent):
+def versine(along: np.ndarray, bent: np.ndarray) -> np.ndarray:
     """(1 - cos(bent s)) / bent^2, which tends to s^2 / 2."""
     curved = bent > FLAT
     return np.where(curved, 2 * (np.sin(0.5 * bent * along) / np.where(curved, bent, 1.0)) ** 2, 0.5 * along**2)
 
 
-def fit_batch(arcs, points, directions, of, lever, tolerance, straight, rounds=GAUSS_NEWTON):
+def fit_batch(
+    arcs: ArcBatch,
+    points: np.ndarray,
+    directions: np.ndarray,
+    of: np.ndarray,
+    lever: np.ndarray,
+    tolerance: float,
+    straight: bool,
+    rounds: int = GAUSS_NEWTON,
+) -> ArcBatch:
     """`arcs.fit_arc` for an ArcBatch; lever: (m,), one for each."""
     if straight:
         arcs = ArcBatch(arcs.origin, arcs.tangent, np.zeros_like(arcs.bend), arcs.low, arcs.high, arcs.closed)
@@ -163,7 +173,9 @@ def fit_batch(arcs, points, directions, of, lever, tolerance, straight, rounds=G
     return arcs
 
 
-def _moments(values, targets, weights, of, count):
+def _moments(
+    values: np.ndarray, targets: np.ndarray, weights: np.ndarray, of: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """(m, k, k) and (m, k, 2) weighted sums of products of values (k, t), with each other and with targets (t, 2)."""
     matrix, right = np.empty((count, len(values), len(values))), np.empty((count, len(values), 2))
     for i, row in enumerate(values * weights):
@@ -174,7 +186,7 @@ def _moments(values, targets, weights, of, count):
     return matrix, right
 
 
-def _turns(frame, cosines, sines, directions):
+def _turns(frame: np.ndarray, cosines: np.ndarray, sines: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """(t, 2) slopes of the points' directions against their arcs, see `arcs`; frame: (t, 3, 3)."""
     x, u, w = np.einsum("tij,tj->it", frame, directions)
     forward = x * cosines + u * sines
@@ -182,7 +194,7 @@ def _turns(frame, cosines, sines, directions):
     return np.stack([(u * cosines - x * sines) / forward, w / forward], axis=1)
 
 
-def _stepped(arcs, steps):
+def _stepped(arcs: ArcBatch, steps: np.ndarray) -> ArcBatch:
     """The arcs after a Gauss-Newton step: rows of steps (m, k, 2) move origins, turn tangents and change bends."""
     moves = steps @ arcs.frame[:, 1:]
     turned = arcs.tangent + moves[:, 1]

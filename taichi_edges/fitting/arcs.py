@@ -32,22 +32,22 @@ class Arc:
     closed: bool = False
 
     @cached_property
-    def curvature(self):
+    def curvature(self) -> float:
         """1 / radius; 0 for a line."""
         return float(np.sqrt(self.bend @ self.bend))
 
     @property
-    def round(self):
+    def round(self) -> float:
         """Length of the whole circle; infinite for a line."""
         return 2 * np.pi / self.curvature if self.curvature > FLAT else np.inf
 
     @property
-    def length(self):
+    def length(self) -> float:
         """From `low` to `high`."""
         return self.high - self.low
 
     @cached_property
-    def frame(self):
+    def frame(self) -> np.ndarray:
         """(3, 3) rows: tangent, inward normal (any, of a line) and the normal of the plane, at the origin."""
         if self.curvature > FLAT:
             inward = self.bend / self.curvature
@@ -56,7 +56,7 @@ class Arc:
             inward /= np.sqrt(inward @ inward)
         return np.array([self.tangent, inward, cross(self.tangent, inward)])
 
-    def coordinates(self, points):
+    def coordinates(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(n,) arc lengths of the nearest places, and (n, 2) offsets from these: inward, and along the plane's normal.
 
         Arc lengths on a circle lie within half a round of the middle of the arc.
@@ -70,20 +70,20 @@ class Arc:
         along -= np.round((along - middle) / self.round) * self.round
         return along, np.stack([inward, w], axis=1)
 
-    def at(self, along):
+    def at(self, along: np.ndarray | float) -> np.ndarray:
         """(n,) arc lengths -> (n, 3) points."""
         along = np.asarray(along, dtype=np.float64)
         x, y = _sine(along, self.curvature), _versine(along, self.curvature)
         tangent, inward, _ = self.frame
         return self.origin + x[..., None] * tangent + self.curvature * y[..., None] * inward
 
-    def tangents(self, along):
+    def tangents(self, along: np.ndarray | float) -> np.ndarray:
         """(n,) arc lengths -> (n, 3) unit tangents."""
         angle = np.asarray(along)[..., None] * self.curvature
         tangent, inward, _ = self.frame
         return np.cos(angle) * tangent + np.sin(angle) * inward
 
-    def recentred(self):
+    def recentred(self) -> "Arc":
         """The same arc with its origin in its middle."""
         middle = 0.5 * (self.low + self.high)
         tangent = self.tangents(middle)
@@ -91,7 +91,7 @@ class Arc:
         origin, half = self.at(middle), 0.5 * self.length
         return Arc(origin, tangent, self.curvature * inward, -half, half, self.closed)
 
-    def cubics(self):
+    def cubics(self) -> np.ndarray:
         """(c, 4, 3) cubic Beziers along the arc, each over a quarter round at most: 3e-4 of the radius off."""
         angle = self.length * self.curvature
         joints = np.linspace(self.low, self.high, max(int(np.ceil(angle / QUARTER - 1e-9)), 1) + 1)
@@ -103,7 +103,7 @@ class Arc:
         starts, ends = places[:-1], places[1:]
         return np.stack([starts, starts + handle * tangents[:-1], ends - handle * tangents[1:], ends], axis=1)
 
-    def shape(self):
+    def shape(self) -> Line | EllipticArc:
         """The Line or EllipticArc it is."""
         if self.curvature <= FLAT:
             return Line(self.at(np.array([self.low, self.high])))
@@ -113,13 +113,13 @@ class Arc:
         high = low + 2 * np.pi if self.closed else min(self.high * self.curvature, low + 2 * np.pi)
         return EllipticArc(self.origin + inward / self.curvature, axes, low, high)
 
-    def over(self, low, high):
+    def over(self, low: float, high: float) -> "Arc":
         """The same arc with other ends; closed if these are a round apart."""
         whole = high - low >= self.round * (1 - 1e-9)
         return replace(self, low=low, high=low + self.round if whole else high, closed=bool(whole))
 
 
-def through_three(start, middle, end):
+def through_three(start: np.ndarray, middle: np.ndarray, end: np.ndarray) -> Arc | None:
     """The Arc from one point through another to a third, origin at the middle one; None where they are on a line."""
     first, second = start - middle, end - middle
     normal = cross(first, second)
@@ -135,23 +135,32 @@ def through_three(start, middle, end):
     return Arc(middle, tangent, to_centre / squared, low, high)
 
 
-def cross(a, b):
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Cross product of two (3,) vectors; np.cross takes ten times as long for a single one."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
-def _sine(along, bent):
+def _sine(along: np.ndarray, bent: float) -> np.ndarray:
     """sin(bent s) / bent, which tends to s."""
     return np.sin(bent * along) / bent if bent > FLAT else along
 
 
-def _versine(along, bent):
+def _versine(along: np.ndarray, bent: float) -> np.ndarray:
     """(1 - cos(bent s)) / bent^2, which tends to s^2 / 2."""
     return 2 * (np.sin(0.5 * bent * along) / bent) ** 2 if bent > FLAT else 0.5 * along**2
 
 
-def fit_arc(arc, points, directions, lever, tolerance, straight, rounds=GAUSS_NEWTON, shares=1.0):
+def fit_arc(
+    arc: Arc,
+    points: np.ndarray,
+    directions: np.ndarray,
+    lever: float,
+    tolerance: float,
+    straight: bool,
+    rounds: int = GAUSS_NEWTON,
+    shares: np.ndarray | float = 1.0,
+) -> Arc:
     """The arc moved, turned and bent to the points: robust Gauss-Newton; its ends are kept.
 
     arc: a start that is near. points, directions: (n, 3). lever: noise of the points over that of the directions,
@@ -182,7 +191,7 @@ def fit_arc(arc, points, directions, lever, tolerance, straight, rounds=GAUSS_NE
     return arc
 
 
-def _turns(frame, cosine, sine, directions):
+def _turns(frame: np.ndarray, cosine: np.ndarray, sine: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """(n, 2) slopes of the points' directions against the arc: towards the centre, and along the plane's normal.
 
     frame: of the arc. cosine, sine: (n,) of the angles from its origin to the points.
@@ -193,7 +202,7 @@ def _turns(frame, cosine, sine, directions):
     return np.stack([(u * cosine - x * sine) / forward, w / forward], axis=1)
 
 
-def _stepped(arc, steps, sides):
+def _stepped(arc: Arc, steps: np.ndarray, sides: np.ndarray) -> Arc:
     """The arc after one Gauss-Newton step: rows of `steps` move its origin, turn its tangent and change its bend."""
     turned = arc.tangent + steps[1] @ sides
     turned /= np.sqrt(turned @ turned)

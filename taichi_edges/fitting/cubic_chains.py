@@ -13,7 +13,7 @@ BENDING = 1e-3  # penalty on second differences of the control points, relative 
 CURVE_SAMPLES = 128  # for each cubic, where distances to a curve are measured
 
 
-def corrected_error(distances, parameters):
+def corrected_error(distances: np.ndarray, parameters: int) -> float:
     """Mean of (n,) distances to a fitted edge, as it would be without the fit's `parameters` adapting to the points.
 
     Across the edge n points give 2 n residuals; sqrt(2 n / (2 n - parameters)) undoes what the fit took away.
@@ -22,7 +22,7 @@ def corrected_error(distances, parameters):
     return float(distances.mean() * np.sqrt(2 * len(distances) / freedom)) if freedom > 0 else float("inf")
 
 
-def fit_chain(points, ordering, tolerance, pieces):
+def fit_chain(points: np.ndarray, ordering: "Ordering", tolerance: float, pieces: int) -> tuple[np.ndarray, float]:
     """`fit_curve` with a given number of pieces."""
     arc, length, closed = ordering.arc, ordering.length, ordering.closed
     weights = np.ones(len(points))
@@ -34,13 +34,13 @@ def fit_chain(points, ordering, tolerance, pieces):
     return curves, corrected_error(distances, 4 * (pieces + 1))  # two across each end of each piece, value and slope
 
 
-def fewest_cubics(points, ordering):
+def fewest_cubics(points: np.ndarray, ordering: "Ordering") -> int:
     """As many cubics as the total turning of (n, 3) ordered points asks for."""
     turning = 2 * np.pi if ordering.closed else total_turning(points, ordering.arc)
     return max(int(np.ceil(turning / TURN_PER_CUBIC)), 4 if ordering.closed else 1)
 
 
-def total_turning(points, arc):
+def total_turning(points: np.ndarray, arc: np.ndarray) -> float:
     """Radians by which the tangent turns along ordered points, after averaging over a tenth of the length."""
     stations = np.linspace(arc.min(), arc.max(), 12)
     width = stations[1] - stations[0]
@@ -51,7 +51,9 @@ def total_turning(points, arc):
     return float(np.arccos(np.clip((steps[1:] * steps[:-1]).sum(axis=1), -1, 1)).sum() * 11 / 8)
 
 
-def _fit_spline(points, parameters, weights, pieces, closed):
+def _fit_spline(
+    points: np.ndarray, parameters: np.ndarray, weights: np.ndarray, pieces: int, closed: bool
+) -> np.ndarray:
     """Least-squares chain of cubics over parameters in 0..1, in `pieces` equal spans -> (pieces, 4, 3) Beziers."""
     if not closed:
         return lsq_chain(parameters * pieces, points, weights, pieces)
@@ -64,7 +66,7 @@ def _fit_spline(points, parameters, weights, pieces, closed):
     return controls
 
 
-def lsq_chain(parameters, points, weights, pieces):
+def lsq_chain(parameters: np.ndarray, points: np.ndarray, weights: np.ndarray, pieces: int) -> np.ndarray:
     """Weighted least-squares chain of cubics with a continuous tangent; piece i has the parameters i .. i + 1.
 
     With equal spans a joint is the middle of the two control points next to it, so the unknowns are the polygon of the
@@ -87,7 +89,7 @@ def lsq_chain(parameters, points, weights, pieces):
     return local @ polygon[unknowns]
 
 
-def nearest_on_chain(points, curves):
+def nearest_on_chain(points: np.ndarray, curves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances (n,) of points to a chain of cubics, and the chain parameters (piece + t) of the nearest places.
 
     The nearest place is looked for on the chords on both sides of the nearest of CURVE_SAMPLES samples of each cubic.
@@ -105,7 +107,7 @@ def nearest_on_chain(points, curves):
     return np.minimum(before, after), np.where(before < after, *reached)
 
 
-def _reparametrize(arc, parameters, length, closed):
+def _reparametrize(arc: np.ndarray, parameters: np.ndarray, length: float, closed: bool) -> np.ndarray:
     """Arc lengths moved to the nearest points of the chain; the ends of an open chain keep the whole range in use."""
     pieces = max(np.ceil(parameters.max()), 1.0)
     moved = parameters / pieces * length

@@ -3,20 +3,21 @@
 import numpy as np
 
 from taichi_edges.fitting.cubic_chains import nearest_on_chain
+from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
 
 
-def distances_to(shape, points):
+def distances_to(shape: Line | EllipticArc | Spline, points: np.ndarray) -> np.ndarray:
     """(n,) distances of points to a shape, ends included."""
-    if shape.kind == "spline":
+    if isinstance(shape, Spline):
         return nearest_on_chain(points, shape.curves)[0]
-    if shape.kind == "line":
+    if isinstance(shape, Line):
         along = shape.points[1] - shape.points[0]
         share = np.clip((points - shape.points[0]) @ along / max(along @ along, 1e-300), 0, 1)
         return np.linalg.norm(points - shape.at(share), axis=1)
     return _distances_to_ellipse(shape, points)
 
 
-def _distances_to_ellipse(shape, points):
+def _distances_to_ellipse(shape: EllipticArc, points: np.ndarray) -> np.ndarray:
     """(n,) distances of points to an EllipticArc: exact for a circle, by Newton's steps on the angle for an ellipse.
 
     Of a point farther from an elliptic arc than its least radius of curvature, too great if the nearest place of the
@@ -37,6 +38,6 @@ def _distances_to_ellipse(shape, points):
     return np.linalg.norm(points - shape.at((t - shape.low) / (shape.high - shape.low)), axis=1)
 
 
-def unit(vector):
+def unit(vector: np.ndarray) -> np.ndarray:
     """A vector of length 1."""
     return vector / max(np.sqrt(vector @ vector), 1e-300)

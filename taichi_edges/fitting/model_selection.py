@@ -5,6 +5,7 @@ of observations. Errors of neighbouring places on an edge go together (a detecto
 next to the edge), so an observation is a stretch of some pixels, however many points it was sampled with.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -14,13 +15,15 @@ from taichi_edges.fitting.arcs import Arc, fit_arc, through_three
 from taichi_edges.fitting.cubic_chains import Ordering, fit_chain
 from taichi_edges.fitting.distances import distances_to, unit
 from taichi_edges.fitting.prices import CUBIC_PRICE, MOST_CUBICS, NEXT_CUBIC_PRICE, OUTLIER, PRICES, price_of
-from taichi_edges.geometry.shapes import EllipticArc, Spline
+from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
 
 LEAST_BEND = 1.0  # noises that the middle of an arc is off its chord, at least
 LEAST_FLATNESS = 0.05  # of an ellipse: the shorter axis over the longer one
 LEAST_ROUND = np.radians(45.0)  # of an ellipse, to be told from other curves
 FIT_ROUNDS = 4
 FEWEST_PLACES = 8  # on a shape, however short it is
+
+Fit = Callable[[], Line | EllipticArc | Spline | None]
 
 
 @dataclass(frozen=True)
@@ -47,13 +50,13 @@ class Track:
     closed: bool = False
 
     @property
-    def ordering(self):
+    def ordering(self) -> Ordering:
         """The same as an Ordering."""
         closing = float(np.linalg.norm(self.points[0] - self.points[-1])) if self.closed else 0.0
         return Ordering(self.arc - self.arc[0], float(self.arc[-1] - self.arc[0]) + closing, self.closed)
 
 
-def misfit(distances, share, yardstick):
+def misfit(distances: np.ndarray, share: np.ndarray, yardstick: Yardstick) -> float:
     """Sum over the observations of squared distances in units of the noise, each at most OUTLIER.
 
     distances: (n,) of places. share: (n,) length that each stands for.
@@ -61,12 +64,14 @@ def misfit(distances, share, yardstick):
     return float((share / yardstick.stretch) @ np.minimum((distances / yardstick.noise) ** 2, OUTLIER))
 
 
-def observations(share, yardstick):
+def observations(share: np.ndarray, yardstick: Yardstick) -> float:
     """How many observations some places are, at least e (whose logarithm is 1)."""
     return max(float(share.sum()) / yardstick.stretch, np.e)
 
 
-def best_shape(track, yardstick, count, worth=np.inf):
+def best_shape(
+    track: Track, yardstick: Yardstick, count: float, worth: float = np.inf
+) -> tuple[Line | EllipticArc | Spline | None, float]:
     """The shape that describes a Track best, and its cost; None and infinity where none is cheaper than `worth`.
 
     count: number of observations of all that is compared.
@@ -83,10 +88,12 @@ def best_shape(track, yardstick, count, worth=np.inf):
     return best, least if best is not None else np.inf
 
 
-def shape_candidates(track, yardstick):
+def shape_candidates(track: Track, yardstick: Yardstick) -> list[tuple[int, Fit]]:
     """Pairs of a price, and a function that fits a shape of at least that price, or None where there is none."""
     tolerance = 3.0 * yardstick.noise
-    found = [] if track.closed else [(PRICES["line"], lambda: fitted_line(track, tolerance).shape())]
+    found: list[tuple[int, Fit]] = []
+    if not track.closed:
+        found.append((PRICES["line"], lambda: fitted_line(track, tolerance).shape()))
     found.append((PRICES["circle" if track.closed else "arc"], partial(bent_shape, track, tolerance)))
     found.append((PRICES["ellipse" if track.closed else "elliptic_arc"], partial(fitted_ellipse, track)))
     for cubics in range(4 if track.closed else 1, MOST_CUBICS + 1):
@@ -96,26 +103,26 @@ def shape_candidates(track, yardstick):
     return sorted(found, key=lambda pair: pair[0])
 
 
-def bent_shape(track, tolerance):
+def bent_shape(track: Track, tolerance: float) -> Line | EllipticArc | None:
     """The circular arc through a Track, or None where it is as good as straight."""
     arc = fitted_arc(track, tolerance, fitted_line(track, tolerance))
     return arc.shape() if arc is not None else None
 
 
-def fitted_spline(track, tolerance, cubics):
+def fitted_spline(track: Track, tolerance: float, cubics: int) -> Spline:
     """The chain of some cubics through a Track."""
     whole = track if track.closed else _with_ends(track)
     return Spline(fit_chain(whole.points, whole.ordering, tolerance, cubics)[0], track.closed)
 
 
-def fitted_line(track, tolerance):
+def fitted_line(track: Track, tolerance: float) -> Arc:
     """The Arc of no bend through a Track."""
     start = Arc(track.points.mean(axis=0), unit(track.points[-1] - track.points[0]), np.zeros(3))
     line = _settled(start, track, tolerance, straight=True)
     return _spanning(line, track)
 
 
-def fitted_arc(track, tolerance, line):
+def fitted_arc(track: Track, tolerance: float, line: Arc) -> Arc | None:
     """The Arc through a Track, or None where it is as good as straight."""
     count = len(track.points)
     start = through_three(*track.points[[0, count // 3, 2 * count // 3] if track.closed else [0, count // 2, -1]])
@@ -127,7 +134,7 @@ def fitted_arc(track, tolerance, line):
     return _spanning(arc, track)
 
 
-def fitted_ellipse(track):
+def fitted_ellipse(track: Track) -> EllipticArc | None:
     """The EllipticArc through a Track, or None where there is no ellipse, or hardly any of it.
 
     Least squares of the conic in the plane of the track (Fitzgibbon, Pilu, Fisher 1999, in OpenCV).
@@ -148,7 +155,7 @@ def fitted_ellipse(track):
     return None if ellipse.circular else _round_ellipse(ellipse, track)
 
 
-def _round_ellipse(ellipse, track):
+def _round_ellipse(ellipse: EllipticArc, track: Track) -> EllipticArc | None:
     """A whole ellipse, cut to the Track along it, in whose direction it goes; None where that is less than a part."""
     offsets = track.points - ellipse.centre
     t = np.unwrap(np.arctan2(*(offsets @ ellipse.axes[k] / ellipse.radii[k] ** 2 for k in (1, 0))))
@@ -163,7 +170,7 @@ def _round_ellipse(ellipse, track):
     )
 
 
-def _with_ends(track):
+def _with_ends(track: Track) -> Track:
     """The Track with one more place at each end, where the stretch that the outermost place stands for ends."""
     (first, second), (before, last) = track.points[:2], track.points[-2:]
     steps = 0.5 * track.share[[0, -1]]
@@ -175,7 +182,7 @@ def _with_ends(track):
     )
 
 
-def _settled(arc, track, tolerance, straight):
+def _settled(arc: Arc, track: Track, tolerance: float, straight: bool) -> Arc:
     """The Arc fitted to a Track, first with a wide tolerance."""
     unused = np.broadcast_to(arc.tangent, track.points.shape)
     for width in (4.0 * tolerance, tolerance):
@@ -183,7 +190,7 @@ def _settled(arc, track, tolerance, straight):
     return arc
 
 
-def _spanning(arc, track):
+def _spanning(arc: Arc, track: Track) -> Arc:
     """The Arc over the whole Track, whose places are the middles of what they stand for."""
     along = arc.coordinates(track.points)[0]
     if arc.curvature > 0:
@@ -196,7 +203,7 @@ def _spanning(arc, track):
     return arc.over(low, low + arc.round if track.closed else min(high, low + arc.round))
 
 
-def track_of(shape, spacing):
+def track_of(shape: Line | EllipticArc | Spline, spacing: float) -> Track:
     """The Track of a shape, places at most `spacing` apart, at the middles of equal steps."""
     count = max(int(np.ceil(shape.length / spacing)), FEWEST_PLACES)
     fine = np.linspace(0, 1, 4 * count + 1)

@@ -7,7 +7,9 @@ planes meet in a line, and that line must be the same for the other views (Fabbr
 And edges are long: the places that the edgels of one edge find lie along a line, those found by chance do not.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
@@ -17,9 +19,13 @@ from taichi_edges.detectors.chains import chain_lengths
 from taichi_edges.kernels.device import download, upload
 from taichi_edges.kernels.points import F32_1D, F32_2D, I32_1D, I32_2D, U8_3D
 from taichi_edges.seeding.starts import ACROSS_PX, ALONG_PX, LEAST_VOTED
-from taichi_edges.splatting.gaussians import orient_gaussians
+from taichi_edges.splatting.gaussians import Gaussians, orient_gaussians
 from taichi_edges.views.cameras import NEAR, SWEPT_FROM, inside_image, project
-from taichi_edges.views.views import pixel_size
+from taichi_edges.views.views import Views, pixel_size
+
+if TYPE_CHECKING:
+    from taichi_edges.progress import Progress
+    from taichi_edges.views.edgels import Edgels
 
 EVERY_PX = 8  # one edgel in each cell of this size is a reference
 LEAST_CHAIN = 20  # edgels; on shorter chains none is
@@ -41,6 +47,9 @@ THINNED_PX = 3.0  # one seed in each cell of this size
 BATCH_BYTES = 64 << 20  # distances from edgels that are kept at the same time
 MARGIN = 2.0  # times the seeds that there is room for: some are false
 SIGHTED = 2000  # seeds that tell how many views see a place
+
+OnDevice = np.ndarray | ti.Ndarray
+DirectionMaps = tuple[OnDevice, OnDevice, OnDevice]  # see `direction_maps`
 
 
 @dataclass(frozen=True)
@@ -182,7 +191,7 @@ def count_in(tally, b):
     return ti.cast(tally >> ti.cast(4 * b, ti.u64) & ti.u64(15), ti.i32)
 
 
-def direction_maps(edgels, height, width):
+def direction_maps(edgels: "Edgels", height: int, width: int) -> DirectionMaps:
     """(V, H, W) uint8 codes of directions of Edgels, see `stamp_directions`; cosines and sines (CODES + 1,) of codes.
 
     All on the device. height, width: pixels.
@@ -200,7 +209,7 @@ def direction_maps(edgels, height, width):
     return codes, upload(np.cos(middles).astype(np.float32)), upload(np.sin(middles).astype(np.float32))
 
 
-def neighbor_views(views):
+def neighbor_views(views: Views) -> list[np.ndarray]:
     """For each view the indices of at most MOST_NEIGHBORS views that see the same from elsewhere, the best first."""
     axes = [np.linspace(low, high, GRID) for low, high in zip(*views.box, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -217,18 +226,19 @@ def neighbor_views(views):
     return chosen
 
 
-def can_sweep(views):
+def can_sweep(views: Views) -> bool:
     """Whether any view has enough neighbours to be swept."""
     return any(len(others) >= TOGETHER for others in neighbor_views(views))
 
 
-def best_and_apart(counts, centres, view):
+def best_and_apart(counts: np.ndarray, centres: np.ndarray, view: int) -> np.ndarray:
     """Indices of at most MOST_NEIGHBORS views with the largest counts that are not 0, the best first.
 
     Of equal ones that which is farthest from those before it, and from the view: where all see the whole scene, they
     shall not be six beside each other. counts: (V,). centres: (V, 3) of the cameras.
     """
-    found, apart = [], np.linalg.norm(centres - centres[view], axis=1)
+    found: list[int] = []
+    apart = np.linalg.norm(centres - centres[view], axis=1)
     counts = counts.copy()
     while len(found) < MOST_NEIGHBORS and counts.any():
         found.append(int(np.argmax(np.where(counts == counts.max(), apart, -1.0))))
@@ -237,19 +247,22 @@ def best_and_apart(counts, centres, view):
     return np.array(found, np.int64)
 
 
-def camera_centres(views):
+def camera_centres(views: Views) -> np.ndarray:
     """(V, 3) unit cube."""
     rotations, offsets = views.world_to_camera[:, :, :3], views.world_to_camera[:, :, 3]
     return -np.einsum("vji,vj->vi", rotations, offsets)
 
 
-def sweep_view(views, view, chosen, others, maps):
+def sweep_view(
+    views: Views, view: int, chosen: np.ndarray, others: np.ndarray, maps: DirectionMaps
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Candidate points and directions (k, 3), counts of views (k,) and pixel sizes (k,) of the chosen edgels of a view.
 
     chosen: (m,) bool, of its edgels. others: indices of its neighbours, at least TOGETHER. maps: `direction_maps`.
     The step in inverse depth is that of STEP_PX along the epipolar line of the farthest neighbour: 1 / NEAR of it
     are far fewer than the 2^31 / ANGLES that a candidate can tell.
     """
+    assert views.edgels is not None
     pixels, normals, _ = views.edgels.of_view(view)
     pixels, normals = pixels[chosen].astype(np.float64), normals[chosen].astype(np.float64)
     lens, pose = views.intrinsics[view], views.world_to_camera[view]
@@ -286,14 +299,14 @@ def sweep_view(views, view, chosen, others, maps):
     return centre + rays[which] / inverse[:, None], directions, counts[which, slot] + 1, 1 / (inverse * lens[0, 0])
 
 
-def through_box(origin, rays, box):
+def through_box(origin: np.ndarray, rays: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where (n, 3) rays enter and leave the box (2, 3), (n,) in multiples of them; not in order where they miss it."""
     with np.errstate(divide="ignore", invalid="ignore"):  # along a side: infinite; in a side: NaN, which is not inside
         sides = (box[:, None] - origin) / rays
     return np.minimum(*sides).max(axis=1), np.maximum(*sides).min(axis=1)
 
 
-def references(edgels, lengths):
+def references(edgels: "Edgels", lengths: np.ndarray) -> np.ndarray:
     """(e,) bool: one of the Edgels in each cell of EVERY_PX px, that on the longest chain, if this is long.
 
     lengths: (e,) edgels on the chain of each.
@@ -308,13 +321,15 @@ def references(edgels, lengths):
     return chosen
 
 
-def sweep_seeds(views, report=None):
+def sweep_seeds(views: Views, report: Callable[[int], None] | None = None) -> SweepSeeds:
     """SweepSeeds of all views. ti.init must have been called. report: called with the number of views done."""
-    maps = direction_maps(views.edgels, views.height, views.width)
-    chosen = references(views.edgels, chain_lengths(views.edgels))
+    edgels = views.edgels
+    assert edgels is not None
+    maps = direction_maps(edgels, views.height, views.width)
+    chosen = references(edgels, chain_lengths(edgels))
     parts = [(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int), np.zeros(0))]
     for view, others in enumerate(neighbor_views(views)):
-        some = chosen[views.edgels.starts[view] : views.edgels.starts[view + 1]]
+        some = chosen[edgels.starts[view] : edgels.starts[view + 1]]
         if len(others) >= TOGETHER and some.any():
             parts.append(sweep_view(views, view, some, others, maps))
         if report is not None:
@@ -324,7 +339,7 @@ def sweep_seeds(views, report=None):
     return SweepSeeds(points, directions, counts, companions, pixel, int(chosen.sum()))
 
 
-def companions_of(points, directions, counts, pixel):
+def companions_of(points: np.ndarray, directions: np.ndarray, counts: np.ndarray, pixel: np.ndarray) -> np.ndarray:
     """(n,) how many views more than chance's agree on candidates nearby on the same line, for each candidate.
 
     points, directions: (n, 3) unit cube. counts: (n,) views that agree on each; two always do. pixel: (n,) unit-cube
@@ -348,7 +363,7 @@ def companions_of(points, directions, counts, pixel):
     return companions
 
 
-def swept_gaussians(views, count, opacity, progress):
+def swept_gaussians(views: Views, count: int, opacity: float, progress: "Progress") -> Gaussians | None:
     """At most `count` Gaussians where views agree on the direction of an edge, laid along it; None if too few.
 
     ti.init must have been called. opacity: 0..1. progress: Progress.
@@ -362,7 +377,7 @@ def swept_gaussians(views, count, opacity, progress):
     return orient_gaussians(seeds.points[chosen], seeds.directions[chosen], along, across, opacity)
 
 
-def best_seeds(seeds, views, count):
+def best_seeds(seeds: SweepSeeds, views: Views, count: int) -> np.ndarray:
     """Indices, rising, of the SweepSeeds with most companions, one in each cell of THINNED_PX, at most `count`.
 
     Nor more than MARGIN times those that the edges have room for: a place on an edge is a reference in each view that
@@ -376,7 +391,7 @@ def best_seeds(seeds, views, count):
     return np.sort(best[: min(count, int(np.ceil(MARGIN * room)))])
 
 
-def views_in_sight(views, points):
+def views_in_sight(views: Views, points: np.ndarray) -> float:
     """Mean number of views that have a point in their image, over (n, 3) points; 0 where there are none."""
     some = points[:: -(-len(points) // SIGHTED)] if len(points) else points
     inside = [inside_image(views.project(some, view)[0], views.width, views.height).sum() for view in range(len(views))]

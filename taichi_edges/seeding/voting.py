@@ -1,5 +1,6 @@
 """Seeds where many views agree that an edge passes: multi-view voting on distance transforms, coarse to fine."""
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -24,7 +25,7 @@ from taichi_edges.kernels.points import (
     nearest_pixel,
 )
 from taichi_edges.views.cameras import DRAWN_FROM
-from taichi_edges.views.views import pixel_size
+from taichi_edges.views.views import Views, pixel_size
 
 STEPS_PER_PIXEL, FARTHEST = 4, 255  # distances are kept in quarter pixels, one byte each
 HALF_DIAGONAL = np.sqrt(3) / 2  # of a unit cell
@@ -43,6 +44,8 @@ EIGHTHS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], 
 AROUND = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)])
 HALF_AROUND = AROUND[14:]  # of each two opposite neighbours the one that comes later
 
+Batch = tuple[slice, np.ndarray | ti.Ndarray]  # some views, and their distance maps on the device
+
 
 @dataclass(frozen=True)
 class Seeds:
@@ -56,12 +59,13 @@ class Seeds:
     pixel: float
 
 
-def distance_maps(edge_maps, threshold, threads=1):
+def distance_maps(edge_maps: np.ndarray, threshold: float, threads: int = 1) -> np.ndarray:
     """(V, H, W) uint8: distance to the nearest edge pixel in quarter pixels, rounded down, at most 255."""
     maps, level = np.empty_like(edge_maps), int(np.ceil(threshold * 255))
 
-    def measure(view):
-        off_edges = cv2.compare(edge_maps[view], level, cv2.CMP_LT)
+    def measure(view: int) -> None:
+        # OpenCV's stubs know no comparison with a number.
+        off_edges = cv2.compare(edge_maps[view], level, cv2.CMP_LT)  # type: ignore[call-overload]
         distances = cv2.distanceTransform(off_edges, cv2.DIST_L2, 5)
         np.minimum(distances, FARTHEST / STEPS_PER_PIXEL, out=distances)  # without edges they are beyond all integers
         cv2.convertScaleAbs(distances, maps[view], STEPS_PER_PIXEL, -0.4999)  # which rounds to the nearest
@@ -77,15 +81,15 @@ class DistanceBatches:
     The maps are made anew in every pass, except where one batch holds all views.
     """
 
-    def __init__(self, edge_maps, threshold):
+    def __init__(self, edge_maps: np.ndarray, threshold: float) -> None:
         self.edge_maps, self.threshold = edge_maps, threshold
         self.size = max(BATCH_BYTES // edge_maps[0].size, 1)
-        self.kept = []
+        self.kept: list[Batch] = []
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[Batch]:
         yield from self.kept or self._make()
 
-    def _make(self):
+    def _make(self) -> Iterator[Batch]:
         for first in range(0, len(self.edge_maps), self.size):
             batch = slice(first, min(first + self.size, len(self.edge_maps)))
             made = batch, device.upload(distance_maps(self.edge_maps[batch], self.threshold, device.threads()))
@@ -156,7 +160,9 @@ def add_scores(
                 scores[i] = scores[i] + falloff[distance]
 
 
-def vote_seeds(views, threshold, generator, most=None, keep=KEEP):
+def vote_seeds(
+    views: Views, threshold: float, generator: np.random.Generator, most: int | None = None, keep: float = KEEP
+) -> Seeds:
     """Seeds of the whole scene box, at most so many, drawn at random. ti.init must have been called.
 
     threshold: of full scale. generator: jitters the finest cells, and draws. keep: share of the views that must see an
@@ -174,7 +180,7 @@ def vote_seeds(views, threshold, generator, most=None, keep=KEEP):
     return Seeds(chosen, line_directions(chosen, points, ALONG_PX * pixel), pixel)
 
 
-def vote_cells(views, distances, pixel, keep=KEEP):
+def vote_cells(views: Views, distances: DistanceBatches, pixel: float, keep: float = KEEP) -> tuple[np.ndarray, float]:
     """The finest cells in which enough views see an edge, and their size, unit-cube units.
 
     Cells are (n, 3) int32, counted from the first corner of the box. pixel: size of a pixel, unit-cube units.
@@ -195,7 +201,9 @@ def vote_cells(views, distances, pixel, keep=KEEP):
     return cells, size
 
 
-def see_edges(views, distances, cells, split, size, keep=KEEP):
+def see_edges(
+    views: Views, distances: DistanceBatches, cells: np.ndarray, split: int, size: float, keep: float = KEEP
+) -> np.ndarray:
     """(n,) bool, or (8 n,) where they are `split` in eighths: whether enough views see an edge in a cell.
 
     That is, within the projected radius of its circumscribed sphere. cells: (n, 3). size: of one after the split.
@@ -216,7 +224,9 @@ def see_edges(views, distances, cells, split, size, keep=KEEP):
     return device.download(near) >= needed
 
 
-def score_cells(views, distances, cells, size, generator):
+def score_cells(
+    views: Views, distances: DistanceBatches, cells: np.ndarray, size: float, generator: np.random.Generator
+) -> tuple[np.ndarray, ...]:
     """One random point in each cell, where it scores better than chance: (n, 3) points and (n,) scores."""
     low, high = views.box
     random = low + generator.random((CHANCE_POINTS, 3)) * (high - low)
@@ -230,7 +240,7 @@ def score_cells(views, distances, cells, size, generator):
     return tuple(np.concatenate(arrays) for arrays in zip(*found))
 
 
-def mean_scores(views, distances, points):
+def mean_scores(views: Views, distances: DistanceBatches, points: np.ndarray) -> np.ndarray:
     """(n,) float32: mean over the views of exp(-d^2 / 2), d pixels from a point's projection to the nearest edge."""
     scores = device.upload(np.zeros(len(points), np.float32))
     points = device.upload(points.astype(np.float32))
@@ -243,7 +253,7 @@ def mean_scores(views, distances, points):
     return device.download(scores) / np.float32(len(views))
 
 
-def nearly_best(points, scores, radius):
+def nearly_best(points: np.ndarray, scores: np.ndarray, radius: float) -> np.ndarray:
     """(n,) bool: those with at least NEARLY the best score within about `radius` (3^3 cells of half the radius)."""
     if len(points) == 0:
         return np.zeros(0, bool)
@@ -264,7 +274,7 @@ def nearly_best(points, scores, radius):
     return scores >= NEARLY * around[cell]
 
 
-def line_directions(points, others, radius):
+def line_directions(points: np.ndarray, others: np.ndarray, radius: float) -> np.ndarray:
     """(n, 3) unit vectors: the first principal axis of those of the `others` that lie within `radius` of each point."""
     tree = cKDTree(others)
     directions = np.tile([1.0, 0.0, 0.0], (len(points), 1))
@@ -284,6 +294,6 @@ def line_directions(points, others, radius):
     return directions
 
 
-def _mean_by(group, counts, values):
+def _mean_by(group: np.ndarray, counts: np.ndarray, values: np.ndarray) -> np.ndarray:
     """(g, m) means of the rows of `values` (n, m) by their `group` (n,), of which `counts` (g,) rows each belong to."""
     return np.stack([np.bincount(group, column, len(counts)) for column in values.T], axis=1) / counts[:, None]

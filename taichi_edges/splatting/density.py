@@ -1,11 +1,15 @@
 """Density control: which Gaussians go, which are doubled. Optimiser moments go along (NumPy, between steps)."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from taichi_edges.evidence.support import exclusive_support
 from taichi_edges.splatting.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from taichi_edges.views.views import Views
 
 
 @dataclass(frozen=True)
@@ -17,10 +21,10 @@ class Population:
     second_moments: np.ndarray
     positional_gradients: np.ndarray
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.gaussians)
 
-    def keep(self, chosen):
+    def keep(self, chosen: np.ndarray) -> "Population":
         """Only the chosen ones, with their moments. chosen: (n,) bool or indices."""
         return Population(
             self.gaussians[chosen],
@@ -30,12 +34,12 @@ class Population:
         )
 
 
-def cull_opacity(population, minimum):
+def cull_opacity(population: Population, minimum: float) -> Population:
     """Those with at least this opacity."""
     return population.keep(population.gaussians.opacities >= minimum)
 
 
-def cull_support(population, views, minimum, threshold):
+def cull_support(population: Population, views: "Views", minimum: float, threshold: float) -> Population:
     """Those that the edge maps support in at least this share of the views, shared support not counted twice.
 
     views: Views. threshold: of full scale. ti.init must have been called.
@@ -44,7 +48,9 @@ def cull_support(population, views, minimum, threshold):
     return population.keep(exclusive_support(views, means, threshold) >= minimum)
 
 
-def duplicate(population, share, copies, distance, maximum, generator):
+def duplicate(
+    population: Population, share: float, copies: int, distance: float, maximum: int, generator: np.random.Generator
+) -> Population:
     """Copies of the Gaussians that the image pulls at most, moved by a normal offset, with moments of zero.
 
     share: the relative gradient from which on a Gaussian is copied: gradients are scaled to 0..1 over all Gaussians

@@ -5,9 +5,13 @@ wins. Only edge pixels have weights of their own, a few percent of all.
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+
+if TYPE_CHECKING:
+    from taichi_edges.views.edgels import Edgels
 
 REACH_PX = 2  # an edge pixel has the strength of the strongest edgel so near, in columns and in rows; lines are 2.4 px
 
@@ -25,7 +29,7 @@ class EdgeWeights:
     means: np.ndarray
 
 
-def weigh_edge_pixels(edge_maps, level, edgels, share):
+def weigh_edge_pixels(edge_maps: np.ndarray, level: int, edgels: "Edgels", share: float) -> EdgeWeights:
     """EdgeWeights 1 - share + share * strength; an edge pixel that no edgel is near has strength 0.
 
     edge_maps: (V, H, W) uint8, edge pixels are those of at least `level`. edgels: Edgels. share: 0..1.
@@ -43,7 +47,7 @@ def weigh_edge_pixels(edge_maps, level, edgels, share):
     return EdgeWeights(starts.astype(np.int32), np.concatenate(values), means)
 
 
-def _strength_map(edgels, view, shape):
+def _strength_map(edgels: "Edgels", view: int, shape: tuple[int, int]) -> np.ndarray:
     """(H, W) uint8: the largest strength, 0..255, of the edgels within REACH_PX of a pixel; 0 where there is none."""
     points, _, strengths = edgels.of_view(view)
     columns, rows = np.rint(points).astype(np.int64).T

@@ -1,6 +1,7 @@
 """Edge Gaussians: NumPy arrays between the stages, Taichi fields with gradients and Adam moments while training."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import taichi as ti
@@ -23,29 +24,29 @@ class Gaussians:
     quaternions: np.ndarray
     opacity_logits: np.ndarray
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.means)
 
     @property
-    def opacities(self):
+    def opacities(self) -> np.ndarray:
         """(n,) in 0..1."""
         return 1.0 / (1.0 + np.exp(-self.opacity_logits))
 
     @property
-    def scales(self):
+    def scales(self) -> np.ndarray:
         """(n, 3) standard deviations along the axes, unit-cube units."""
         return np.exp(self.log_scales)
 
-    def directions(self):
+    def directions(self) -> np.ndarray:
         """(n, 3) unit vectors along the axis of the largest scale (paper 3.2: principal direction), sign arbitrary."""
         axes = rotation_matrices(self.quaternions)
         return np.take_along_axis(axes, self.log_scales.argmax(axis=1)[:, None, None], axis=2)[:, :, 0]
 
-    def __getitem__(self, index):
+    def __getitem__(self, index: np.ndarray | slice) -> "Gaussians":
         return Gaussians(self.means[index], self.log_scales[index], self.quaternions[index], self.opacity_logits[index])
 
 
-def rotation_matrices(quaternions):
+def rotation_matrices(quaternions: np.ndarray) -> np.ndarray:
     """(n, 4) w, x, y, z of any length -> (n, 3, 3); column j is the j-th axis of the Gaussian in the world."""
     w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
     rows = [
@@ -56,12 +57,14 @@ def rotation_matrices(quaternions):
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def logit(opacity):
+def logit(opacity: float) -> float:
     """Inverse of the logistic function."""
     return np.log(opacity / (1.0 - opacity))
 
 
-def start_gaussians(points, generator, scale=SCALE_INIT, opacity=OPACITY_INIT):
+def start_gaussians(
+    points: np.ndarray, generator: np.random.Generator, scale: float = SCALE_INIT, opacity: float = OPACITY_INIT
+) -> Gaussians:
     """Gaussians at given points, as the supplement starts them: constant scale and opacity, random unit quaternions.
 
     points: (n, 3) unit-cube units. generator: numpy.random.Generator.
@@ -77,7 +80,9 @@ def start_gaussians(points, generator, scale=SCALE_INIT, opacity=OPACITY_INIT):
     )
 
 
-def orient_gaussians(points, directions, along, across, opacity):
+def orient_gaussians(
+    points: np.ndarray, directions: np.ndarray, along: float | np.ndarray, across: float | np.ndarray, opacity: float
+) -> Gaussians:
     """Gaussians at (n, 3) points with their first axis along (n, 3) unit `directions`.
 
     along, across: standard deviations along that axis and across it, unit-cube units. opacity: 0..1.
@@ -96,7 +101,7 @@ def orient_gaussians(points, directions, along, across, opacity):
     )
 
 
-def round_capacity(count):
+def round_capacity(count: int) -> int:
     """The smallest power of two that holds `count`, and at least MIN_CAPACITY."""
     return max(MIN_CAPACITY, 1 << int(np.ceil(np.log2(max(count, 1)))))
 
@@ -109,7 +114,7 @@ class GaussianFields:
 
     ARRAYS = ("means", "log_scales", "quaternions", "opacity_logits")
 
-    def __init__(self, capacity, real=ti.f32):
+    def __init__(self, capacity: int, real: Any = ti.f32) -> None:
         self.capacity, self.real, self.count = capacity, real, 0
         self.means = ti.Vector.field(3, real, shape=capacity, needs_grad=True)
         self.log_scales = ti.Vector.field(3, real, shape=capacity, needs_grad=True)
@@ -119,13 +124,15 @@ class GaussianFields:
         self.second_moments = ti.Vector.field(11, real, shape=capacity)
         self.positional_gradients = ti.field(real, shape=capacity)  # sum of |d loss / d pixel| since the last reset
 
-    def _put(self, field, values):
+    def _put(self, field: ti.Field, values: np.ndarray) -> None:
         dtype = np.float64 if self.real == ti.f64 else np.float32
         whole = np.zeros((self.capacity, *values.shape[1:]), dtype)
         whole[: len(values)] = values
         field.from_numpy(whole)
 
-    def load(self, gaussians, first_moments=None, second_moments=None):
+    def load(
+        self, gaussians: Gaussians, first_moments: np.ndarray | None = None, second_moments: np.ndarray | None = None
+    ) -> None:
         """Fill from NumPy; moments (n, 11) continue an optimisation, without them Adam starts anew."""
         assert len(gaussians) <= self.capacity, (len(gaussians), self.capacity)
         self.count = len(gaussians)
@@ -138,10 +145,10 @@ class GaussianFields:
         for name in self.ARRAYS:
             getattr(self, name).grad.fill(0)
 
-    def gaussians(self):
+    def gaussians(self) -> Gaussians:
         """The parameters in use, as NumPy."""
         return Gaussians(*(getattr(self, name).to_numpy()[: self.count] for name in self.ARRAYS))
 
-    def moments(self):
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Adam's two moments in use, (n, 11) each."""
         return self.first_moments.to_numpy()[: self.count], self.second_moments.to_numpy()[: self.count]

@@ -1,9 +1,15 @@
 """The paper's regularisers, differentiated by Taichi: L_orient (eq. 4) and L_shape (eq. 5)."""
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 import taichi as ti
 
 from taichi_edges.splatting.projection import rotation
+
+if TYPE_CHECKING:
+    from taichi_edges.splatting.gaussians import GaussianFields
 
 
 class NeighborFields:
@@ -13,7 +19,7 @@ class NeighborFields:
     fixed order: scattered with atomics, the last bits of a sum would depend on which thread came first.
     """
 
-    def __init__(self, capacity, k, real=ti.f32):
+    def __init__(self, capacity: int, k: int, real: Any = ti.f32) -> None:
         self.capacity, self.k = capacity, k
         self.indices = ti.field(ti.i32, shape=(capacity, k))
         self.means = ti.Vector.field(3, real, shape=(capacity, k), needs_grad=True)
@@ -21,7 +27,7 @@ class NeighborFields:
         self.user_starts = ti.field(ti.i32, shape=capacity + 1)
         self.users = ti.field(ti.i32, shape=capacity * k)  # flat positions into (capacity, k)
 
-    def load(self, neighbors):
+    def load(self, neighbors: np.ndarray) -> None:
         """neighbors: (n, k) int indices of the nearest other Gaussians."""
         count = len(neighbors)
         indices = np.zeros((self.capacity, self.k), np.int32)
@@ -35,7 +41,9 @@ class NeighborFields:
         self.means.grad.fill(0)
 
 
-def make_regularizers(gaussians, neighbors, loss):
+def make_regularizers(
+    gaussians: "GaussianFields", neighbors: NeighborFields, loss: ti.Ndarray
+) -> Callable[[int, float, float], None]:
     """regularize(count, orient_weight, shape_weight): both regularisers, added to `loss` (0-D ndarray), for the tape.
 
     L_orient as the text of 3.2 defines it: the principal direction d_i points towards the k nearest neighbours,
@@ -44,8 +52,9 @@ def make_regularizers(gaussians, neighbors, loss):
     means, log_scales, quaternions = gaussians.means, gaussians.log_scales, gaussians.quaternions
     indices, neighbor_means = neighbors.indices, neighbors.means
     users, user_starts, k = neighbors.users, neighbors.user_starts, neighbors.k
+    real = gaussians.real
     # A field of its own: the adjoint that Taichi makes for an ndarray reads the wrong memory on Vulkan.
-    total = ti.field(gaussians.real, shape=(), needs_grad=True)
+    total = ti.field(real, shape=(), needs_grad=True)
 
     @ti.kernel
     def copy(count: ti.i32):
@@ -56,11 +65,11 @@ def make_regularizers(gaussians, neighbors, loss):
     @ti.kernel
     def gather(count: ti.i32):
         for i in range(count):
-            pulls = ti.Vector.zero(gaussians.real, 3)
+            pulls = ti.Vector.zero(real, 3)
             for position in range(user_starts[i], user_starts[i + 1]):
                 user = users[position]
                 pulls += neighbor_means.grad[user // k, user % k]
-                neighbor_means.grad[user // k, user % k] = ti.Vector.zero(gaussians.real, 3)
+                neighbor_means.grad[user // k, user % k] = ti.Vector.zero(real, 3)
             means.grad[i] += pulls
 
     @ti.ad.grad_replaced
@@ -72,7 +81,7 @@ def make_regularizers(gaussians, neighbors, loss):
         gather(count)
 
     @ti.kernel
-    def sum_up(count: ti.i32, orient_weight: gaussians.real, shape_weight: gaussians.real):
+    def sum_up(count: ti.i32, orient_weight: real, shape_weight: real):
         for i in range(count):
             axes = rotation(quaternions[i])
             s = ti.exp(log_scales[i])
@@ -91,12 +100,12 @@ def make_regularizers(gaussians, neighbors, loss):
             total[None] += (orient_weight * (1.0 - alignment / k) + shape_weight * second / largest) / count
 
     @ti.kernel
-    def move_total(loss: ti.types.ndarray(dtype=gaussians.real, ndim=0)):
+    def move_total(loss: ti.types.ndarray(dtype=real, ndim=0)):
         loss[None] += total[None]
         total[None] = 0.0
 
     @ti.kernel
-    def take_gradient(loss_gradient: ti.types.ndarray(dtype=gaussians.real, ndim=0)):
+    def take_gradient(loss_gradient: ti.types.ndarray(dtype=real, ndim=0)):
         total.grad[None] = loss_gradient[None]
 
     @ti.ad.grad_replaced

@@ -1,12 +1,18 @@
 """Adam over the 11 parameters of every Gaussian, one kernel, which also zeroes the gradients it has used."""
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 import taichi as ti
+
+if TYPE_CHECKING:
+    from taichi_edges.splatting.gaussians import GaussianFields
 
 BETA1, BETA2 = 0.9, 0.999
 EPSILON = 1e-15  # as in 3D Gaussian Splatting: the loss is a mean, so its gradients are small
 
 
-def make_adam(gaussians):
+def make_adam(gaussians: "GaussianFields") -> Callable[..., None]:
     """Kernel adam(count, correction1, correction2, means_rate, scales_rate, quaternions_rate, opacities_rate).
 
     correction = 1 / (1 - beta^step). A rate of 0 leaves its parameters alone; their moments go on.

@@ -1,9 +1,15 @@
 """Projection of 3D Gaussians to 2D splats (EWA)."""
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 import taichi as ti
 
 from taichi_edges.views.cameras import DRAWN_FROM
+
+if TYPE_CHECKING:
+    from taichi_edges.splatting.gaussians import GaussianFields
 
 SCREEN_BLUR = 0.3  # px^2 added to the 2D covariance; its loss of peak is compensated in the opacity
 ALPHA_MIN = 1.0 / 255.0  # a smaller contribution is not drawn
@@ -49,7 +55,7 @@ def rotation(quaternion):
 class CameraFields:
     """All cameras of a scene on the device: world_to_camera (3, 4) and (fx, fy, cx, cy). No skew."""
 
-    def __init__(self, intrinsics, world_to_camera, real=ti.f32):
+    def __init__(self, intrinsics: np.ndarray, world_to_camera: np.ndarray, real: Any = ti.f32) -> None:
         count = 1 << int(np.ceil(np.log2(max(len(intrinsics), 64))))  # a changed size recompiles the projection
         dtype = np.float64 if real == ti.f64 else np.float32
         self.world_to_camera = ti.Matrix.field(3, 4, real, shape=count)
@@ -68,12 +74,12 @@ class SplatFields:
     alpha(p) = opacity * exp(-(a du^2 + c dv^2) / 2 - b du dv), d = p - (u, v) in pixels. An empty box is not drawn.
     """
 
-    def __init__(self, capacity, real=ti.f32):
+    def __init__(self, capacity: int, real: Any = ti.f32) -> None:
         self.splats = ti.Vector.field(6, real, shape=capacity, needs_grad=True)
         self.boxes = ti.Vector.field(4, ti.i32, shape=capacity)
 
 
-def make_splat_of(gaussians, cameras, exp2):
+def make_splat_of(gaussians: "GaussianFields", cameras: CameraFields, exp2: Callable) -> Callable:
     """ti.func splat_of(i, view) -> (splat, blurred variances along u and v, depth) of a Gaussian. exp2: ti.func."""
     means, log_scales = gaussians.means, gaussians.log_scales
     quaternions, opacity_logits = gaussians.quaternions, gaussians.opacity_logits
@@ -121,7 +127,7 @@ def box_of(splat, variances, depth, width, height):
     return ti.Vector([u0, u1, v0, v1])
 
 
-def make_project(gaussians, cameras, target):
+def make_project(gaussians: "GaussianFields", cameras: CameraFields, target: SplatFields) -> Any:
     """Kernel project(count, view): GaussianFields -> SplatFields.splats, where the boxes are not empty.
 
     Its `.grad` is Taichi's own. Of a large scene a view sees a small part; the rest costs nothing on the way back.

@@ -5,6 +5,9 @@ mask of the selected ones and the number of those before it, so that the slots o
 two look-ups give. Whatever the splat reads and writes at a pixel is kept by slot: a few thousand numbers, not an image.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import taichi as ti
 
@@ -13,7 +16,7 @@ MULTIPLIER, INCREMENT = 747796405, 2891336453  # of the generator's linear congr
 BLOCK = 512  # Taichi's CPU backend gives a thread no fewer items of a range-for than this
 
 
-def pack_mask(edges):
+def pack_mask(edges: np.ndarray) -> np.ndarray:
     """(H, W) bool -> (H, ceil(W / 32)) uint32, bit b of word w is column 32 w + b."""
     height, width = edges.shape
     packed = np.packbits(edges, axis=1, bitorder="little")
@@ -31,7 +34,7 @@ class PixelSelection:
     combined, and adjoint (capacity,) = -T dL/dT.
     """
 
-    def __init__(self, height, width, capacity, pages, planes, real=ti.f32):
+    def __init__(self, height: int, width: int, capacity: int, pages: int, planes: int, real: Any = ti.f32) -> None:
         self.height, self.width, self.capacity, self.real = height, width, capacity, real
         self.words = ti.ndarray(ti.u32, shape=(pages, height, -(-width // WORD), 2))
         self.columns = ti.field(real, shape=(pages, capacity))
@@ -44,7 +47,7 @@ class PixelSelection:
         self.views, self.counts = np.zeros(pages, np.int64), np.zeros(pages, np.int64)
 
     @property
-    def pages(self):
+    def pages(self) -> int:
         """Views that can be selected at once."""
         return len(self.counts)
 
@@ -102,7 +105,7 @@ def whole_word(word, width):
     return ti.u32(0xFFFFFFFF) >> ti.cast(ti.max((word + 1) * WORD - width, 0), ti.u32)
 
 
-def make_list_row(selection, packed, level):
+def make_list_row(selection: PixelSelection, packed: bool, level: int | None) -> Callable:
     """ti.func list_row(page, view, row, width, first, edge_maps, starts, weights, words): fill the slots of a row.
 
     They are filled from `first` on. Returns the first slot of the next row. packed: whether edge maps and weights are
@@ -167,7 +170,9 @@ def make_list_row(selection, packed, level):
     return list_row
 
 
-def make_select(selection, threads, schedule, level=None):
+def make_select(
+    selection: PixelSelection, threads: int, schedule: str, level: int | None = None
+) -> Callable[..., None]:
     """select(count, views, seeds, backgrounds, edge_maps, mask_words, starts, weights, words): one view per page.
 
     views, seeds, backgrounds: (count,). All pixels of a view's mask, which has at least its edge pixels, and
@@ -177,7 +182,7 @@ def make_select(selection, threads, schedule, level=None):
     return make_select_parallel(selection, level) if schedule == "log" else make_select_pages(selection, threads, level)
 
 
-def make_select_pages(selection, threads, level):
+def make_select_pages(selection: PixelSelection, threads: int, level: int | None) -> Callable[..., None]:
     """Kernel select for a CPU: one page is one thread's."""
     lanes = min(threads, selection.pages)  # pages worked on at once
     list_row = make_list_row(selection, False, level)
@@ -242,7 +247,7 @@ def make_select_pages(selection, threads, level):
     return select
 
 
-def make_select_parallel(selection, level):
+def make_select_parallel(selection: PixelSelection, level: int | None) -> Callable[..., None]:
     """select for a GPU: as many threads as there are words, draws and rows, and no long loop in any of them.
 
     One thread for a page would go some 60 000 rounds one after the other; Mesa's software driver silently ends the

@@ -11,22 +11,38 @@ nothing is written twice, so there are no atomics; Taichi's own adjoint of the p
 A launch that wakes a second thread costs as much as several hundred Gaussians, so what can be one kernel is one.
 """
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 import taichi as ti
 
 from taichi_edges.splatting.projection import (
     ALPHA_MAX,
     ALPHA_MIN,
     LOG2_E,
+    CameraFields,
+    SplatFields,
     box_of,
     exact_exp2,
     fast_exp2,
     make_project,
     make_splat_of,
 )
-from taichi_edges.splatting.selection import BLOCK, slots_of
+from taichi_edges.splatting.selection import BLOCK, PixelSelection, slots_of
+
+if TYPE_CHECKING:
+    from taichi_edges.splatting.gaussians import GaussianFields
 
 
-def make_compare(gaussians, cameras, target, selection, loss, threads, schedule):
+def make_compare(
+    gaussians: "GaussianFields",
+    cameras: CameraFields,
+    target: SplatFields,
+    selection: PixelSelection,
+    loss: ti.Ndarray,
+    threads: int,
+    schedule: str,
+) -> Callable[..., None]:
     """compare(count, page, view, level, edge_weight, background_weight): Gaussians -> loss, for the tape.
 
     L_proj (eq. 3) of the pixels selected in `page`, of which `view` says where they are seen from: the sum of
@@ -53,7 +69,14 @@ def make_compare(gaussians, cameras, target, selection, loss, threads, schedule)
     return compare
 
 
-def make_draw(gaussians, cameras, target, selection, threads, schedule):
+def make_draw(
+    gaussians: "GaussianFields",
+    cameras: CameraFields,
+    target: SplatFields,
+    selection: PixelSelection,
+    threads: int,
+    schedule: str,
+) -> Callable[..., None]:
     """Kernel draw(count, page, view, width, height, words): Gaussians -> SplatFields and the selection's planes."""
     real = selection.real
     splats, boxes = target.splats, target.boxes
@@ -113,7 +136,7 @@ def make_draw(gaussians, cameras, target, selection, threads, schedule):
     return draw_log if schedule == "log" else draw_product
 
 
-def make_blend(selection, schedule):
+def make_blend(selection: PixelSelection, schedule: str) -> Callable[..., None]:
     """Kernel blend(slots, page, level, edge_weight, background_weight, loss): planes -> T, adjoint and loss.
 
     Leaves the planes empty for the next view. Serial on a CPU: a few thousand slots do not pay for waking a thread, and
@@ -181,7 +204,7 @@ def make_blend(selection, schedule):
     return blend_parallel if schedule == "log" else blend_serial
 
 
-def make_gather(gaussians, target, selection):
+def make_gather(gaussians: "GaussianFields", target: SplatFields, selection: PixelSelection) -> Callable[..., None]:
     """Kernel gather(count, page, words, loss_gradient): the slots' adjoints -> gradients of the splats (assigned)."""
     real = selection.real
     splats, boxes, positional = target.splats, target.boxes, gaussians.positional_gradients

@@ -2,7 +2,9 @@
 
 import time
 from collections import deque
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +14,13 @@ from taichi_edges.splatting import density
 from taichi_edges.splatting.density import Population
 from taichi_edges.splatting.gaussians import Gaussians, logit
 from taichi_edges.splatting.splatter import GPU_ARCHS, Splatter
+
+if TYPE_CHECKING:
+    from taichi_edges.progress import Progress
+    from taichi_edges.scene.settings import TrainConfig
+    from taichi_edges.views.views import Views
+
+Action = Callable[[Population], Population]  # of density control
 
 SETTLED_PASSES = 2  # over the views; the pixels drawn anew make the loss of a single pass uncertain by 0.7 %
 ESTABLISHED_OPACITY = 0.2  # fainter ones are in no result: the least of the filters
@@ -28,7 +37,7 @@ class LogRecord:
     gaussians: int
 
 
-def rates(config, share):
+def rates(config: "TrainConfig", share: float) -> tuple[float, float, float, float]:
     """Learning rates (means, scales, quaternions, opacities) after a share of the run (supplement, "Training")."""
     decays = min(int(share / config.means_decay_every + 1e-9), config.means_decays)
     means = config.learning_rates.means * config.means_decay**decays
@@ -38,7 +47,7 @@ def rates(config, share):
     return means, others.scales, others.quaternions, others.opacities
 
 
-def nearest_neighbors(points, k):
+def nearest_neighbors(points: np.ndarray, k: int) -> np.ndarray:
     """(n, 3) -> (n, k) indices of the k nearest other points, from Open3D's KD-tree; the last repeats where n <= k."""
     import open3d as o3d
 
@@ -57,21 +66,23 @@ def nearest_neighbors(points, k):
 class Settling:
     """How much the loss still falls: what each view has now against what it had one pass before."""
 
-    def __init__(self, views):
+    def __init__(self, views: np.ndarray) -> None:
         """views: (n,) indices of those that are visited."""
-        self.last = {}
-        self.before, self.now = (deque(maxlen=SETTLED_PASSES * len(views)) for _ in range(2))
+        self.last: dict[int, float] = {}
+        self.steps = SETTLED_PASSES * len(views)
+        self.before: deque[float] = deque(maxlen=self.steps)
+        self.now: deque[float] = deque(maxlen=self.steps)
 
-    def add(self, view, loss):
+    def add(self, view: int, loss: float) -> None:
         """The loss that a view has now."""
         if view in self.last:
             self.before.append(self.last[view])
             self.now.append(loss)
         self.last[view] = loss
 
-    def drop(self):
+    def drop(self) -> float:
         """Share by which a pass has lowered the loss, over the last SETTLED_PASSES; infinite before there are any."""
-        if len(self.now) < self.now.maxlen:
+        if len(self.now) < self.steps:
             return np.inf
         return 1.0 - sum(self.now) / sum(self.before)
 
@@ -79,9 +90,11 @@ class Settling:
 class Training:
     """The state of one training run. `config` is the scene's `train` section."""
 
-    def __init__(self, views, config, generator, threads=1, arch="cpu"):
+    def __init__(
+        self, views: "Views", config: "TrainConfig", generator: np.random.Generator, threads: int = 1, arch: str = "cpu"
+    ) -> None:
         self.views, self.config, self.generator = views, config, generator
-        self.neighbors_at = None
+        self.neighbors_at: int | None = None
         self.splatter = Splatter(
             views.edge_maps,
             views.intrinsics,
@@ -102,7 +115,7 @@ class Training:
         self.settling = Settling(self.visited)
         self.actions = self._actions()
 
-    def run(self, gaussians, progress):
+    def run(self, gaussians: Gaussians, progress: "Progress") -> tuple[Gaussians, list[LogRecord]]:
         """Train `gaussians`. Returns the trained ones and the list of LogRecords."""
         self.splatter.load(gaussians)
         records, losses, started = [], [], time.monotonic()
@@ -123,13 +136,13 @@ class Training:
                     break
         return self.splatter.fields.gaussians(), records
 
-    def _has_settled(self, step):
+    def _has_settled(self, step: int) -> bool:
         """Whether the run may end here: all that is scheduled has begun, and the loss hardly falls."""
         config = self.config
         begun = max(config.only_means, config.regularize_from) * self.total
         return step >= max(begun, *self.actions, 1) and 0 < config.settled >= self.settling.drop()
 
-    def _views_with_pixels(self):
+    def _views_with_pixels(self) -> np.ndarray:
         """Indices of the views in which pixels can be selected: for eq. 3 those with edge pixels."""
         if self.config.loss != "balanced":
             return np.arange(len(self.views))
@@ -141,7 +154,7 @@ class Training:
             )
         return visited
 
-    def _selected_views(self):
+    def _selected_views(self) -> Iterator[tuple[int, int]]:
         """(page, view) without end: pass after pass in random order, their pixels selected some views at a time."""
         pages = self.splatter.selection.pages
         while True:
@@ -152,7 +165,7 @@ class Training:
                 self.splatter.select_pixels(order[some], seeds[some])
                 yield from enumerate(order[some])
 
-    def _step(self, step, page):
+    def _step(self, step: int, page: int) -> float | None:
         """One view step. Returns L_proj, or None where the regularisers are in the loss."""
         share = (step - 1) / self.total
         weights = self._regularizer_weights(step, share)
@@ -161,7 +174,7 @@ class Training:
         self.splatter.update(step, *rates(self.config, share))
         return loss
 
-    def _regularizer_weights(self, step, share):
+    def _regularizer_weights(self, step: int, share: float) -> tuple[float, float]:
         """lambda_1 and lambda_2 of eq. 6 in the steps that apply them, (0, 0) in the others."""
         config, count = self.config, self.splatter.fields.count
         if share < config.regularize_from or step % config.regularize_every or count <= config.neighbors:
@@ -171,9 +184,10 @@ class Training:
             self.neighbors_at = step
         return config.orient_weight, config.shape_weight
 
-    def _actions(self):
+    def _actions(self) -> dict[int, list[Action]]:
         """Step -> what density control does after it."""
-        config, actions = self.config.density, {}
+        config = self.config.density
+        actions: dict[int, list[Action]] = {}
         for shares, action in (
             (config.duplicate_at, self._duplicate),
             (config.cull_support_at, self._cull_support),
@@ -188,7 +202,7 @@ class Training:
                 actions.setdefault(step, []).append(self._take_in_flanks)
         return actions
 
-    def _control_density(self, step):
+    def _control_density(self, step: int) -> None:
         """Culling and duplication where the schedule asks for it after this step."""
         if step not in self.actions:
             return
@@ -206,21 +220,21 @@ class Training:
         self.neighbors_at = None
         self.settling = Settling(self.visited)  # a cull makes the loss jump
 
-    def _duplicate(self, population):
+    def _duplicate(self, population: Population) -> Population:
         config = self.config.density
         maximum, distance = config.max_gaussians, config.duplicate_distance
         share, copies = config.duplicate_gradient, config.duplicate_copies
         return density.duplicate(population, share, copies, distance, maximum, self.generator)
 
-    def _cull_support(self, population):
+    def _cull_support(self, population: Population) -> Population:
         config, threshold = self.config.density, self.config.edge_threshold
         population = density.cull_support(population, self.views, config.min_support, threshold)
         return self._limit_opacity(population)
 
-    def _cull_opacity(self, population):
+    def _cull_opacity(self, population: Population) -> Population:
         return self._limit_opacity(density.cull_opacity(population, self.config.density.min_opacity))
 
-    def _take_in_flanks(self, population):
+    def _take_in_flanks(self, population: Population) -> Population:
         """The mask with the flanks of the lines, except where an edge that other views have established is hidden."""
         config, gaussians = self.config, population.gaussians
         points = np.zeros((0, 3))
@@ -230,7 +244,7 @@ class Training:
         self.splatter.take_in_flanks(points)
         return population
 
-    def _limit_opacity(self, population):
+    def _limit_opacity(self, population: Population) -> Population:
         """Opacities down to the initial one after a cull, so that the survivors must earn theirs again (as in 3DGS)."""
         if not self.config.density.reset_opacity:
             return population

@@ -7,20 +7,27 @@ lines of others there is pushed away by their flanks. So flanks are left out whe
 established projects to a place without an edge pixel (paper Fig. 2).
 """
 
+from typing import Any
+
 import numpy as np
 import taichi as ti
 
 from taichi_edges.kernels.device import download, upload
-from taichi_edges.kernels.points import F32_2D, F32_3D, load_camera, load_point, nearest_pixel
+from taichi_edges.kernels.points import F32_2D, F32_3D, I32_1D, load_camera, load_point, nearest_pixel
 from taichi_edges.splatting.selection import WORD
 
 CLEAR_PX = 2  # an edge pixel so near, in columns and in rows, and the view shows the edge
 REACH_PX = 5  # around the centre of a Gaussian that is hidden: 3 standard deviations of a px, and the way to the next
-U32_3D = ti.types.ndarray(dtype=ti.u32, ndim=3)
-I32_1D = ti.types.ndarray(dtype=ti.i32, ndim=1)
+U32_3D: Any = ti.types.ndarray(dtype=ti.u32, ndim=3)
 
 
-def mask_with_flanks(edge_words, line_words, width, projections, points):
+def mask_with_flanks(
+    edge_words: np.ndarray | ti.Ndarray,
+    line_words: np.ndarray | ti.Ndarray,
+    width: int,
+    projections: np.ndarray,
+    points: np.ndarray,
+) -> tuple[np.ndarray | ti.Ndarray, np.ndarray]:
     """The pixels that are in the loss of each view for sure: those of lines, but no flanks where `points` are hidden.
 
     edge_words, line_words: (V, H, W / 32) bit masks of the edge pixels and of all pixels of the lines, where the

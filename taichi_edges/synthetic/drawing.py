@@ -34,12 +34,20 @@ class Imperfections:
     contours: bool = True
 
     @staticmethod
-    def none():
+    def none() -> "Imperfections":
         """Clean maps: the visible sharp edges, all of them and nothing else."""
         return Imperfections(blur_px=0.0, gap_fraction=0.0, jitter_px=0.0, speckle=0.0, noise=0.0, contours=False)
 
 
-def draw_edge_map(pixels, chains, strokes, visible, image_size, imperfections, generator):
+def draw_edge_map(
+    pixels: np.ndarray,
+    chains: np.ndarray,
+    strokes: np.ndarray,
+    visible: np.ndarray,
+    image_size: int,
+    imperfections: Imperfections,
+    generator: np.random.Generator,
+) -> np.ndarray:
     """One edge map.
 
     pixels: (n, 2) samples, less than a pixel apart along a chain. chains, strokes: (n,) int, see `LineSamples`.
@@ -56,7 +64,13 @@ def draw_edge_map(pixels, chains, strokes, visible, image_size, imperfections, g
     return finish(gaussian_lines(starts, ends, image_size, sigma), imperfections, generator)
 
 
-def in_gap(starts, ends, strokes, imperfections, generator):
+def in_gap(
+    starts: np.ndarray,
+    ends: np.ndarray,
+    strokes: np.ndarray,
+    imperfections: Imperfections,
+    generator: np.random.Generator,
+) -> np.ndarray:
     """(s,) bool: which of the (s, 2) consecutive segments fall into a randomly placed gap of their stroke."""
     lengths, middles = np.linalg.norm(ends - starts, axis=1), (starts + ends) / 2.0
     missing = np.zeros(len(starts), bool)
@@ -70,7 +84,7 @@ def in_gap(starts, ends, strokes, imperfections, generator):
     return missing
 
 
-def false_dashes(image_size, imperfections, generator):
+def false_dashes(image_size: int, imperfections: Imperfections, generator: np.random.Generator) -> np.ndarray:
     """(d, 2, 2) end points of short lines where there is no edge."""
     count = generator.poisson(imperfections.speckle * image_size**2 / 1e4)
     middles = generator.uniform(0.0, image_size - 1.0, (count, 2))
@@ -83,7 +97,7 @@ def false_dashes(image_size, imperfections, generator):
     return np.stack([chain[:-1], chain[1:]], axis=2).reshape(-1, 2, 2)
 
 
-def gaussian_lines(starts, ends, image_size, sigma):
+def gaussian_lines(starts: np.ndarray, ends: np.ndarray, image_size: int, sigma: float) -> np.ndarray:
     """(H, W) in 0..1: exp(-d^2 / 2 sigma^2) of the distance d to the nearest of the (s, 2) short segments.
 
     The nearest one alone counts, so that lines are no brighter where they cross or where a chain has its joints.
@@ -103,7 +117,7 @@ def gaussian_lines(starts, ends, image_size, sigma):
     return np.exp(-field / (2.0 * sigma**2)).reshape(image_size, image_size)
 
 
-def finish(lines, imperfections, generator):
+def finish(lines: np.ndarray, imperfections: Imperfections, generator: np.random.Generator) -> np.ndarray:
     """Blur and noise; (H, W) in 0..1 -> uint8."""
     if imperfections.blur_px > 0:
         lines = cv2.GaussianBlur(lines, (0, 0), imperfections.blur_px)

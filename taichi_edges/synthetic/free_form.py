@@ -1,12 +1,13 @@
 """Hard parts with faces of their own: a bent pipe, a chamfered nut, a twisted blade."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from taichi_edges.geometry.bezier import evaluate_bezier
 from taichi_edges.synthetic.profiles import PIECE_FACETS, Path, Profile, Segment, arc, circle, rectangle
-from taichi_edges.synthetic.solids import assemble
+from taichi_edges.synthetic.solids import Part, assemble
 from taichi_edges.synthetic.surfaces import Surface, cap, grid_triangles, lift, wall
 
 BEND_FACETS = 48  # of a quarter turn: a chord leaves a bend of radius 0.4 by 5e-5, the profiles' CHORD_ERROR
@@ -20,8 +21,10 @@ BLADE_SECTIONS = (  # turn in degrees, chord, shift in x and y of the four rows 
 )
 HYPERBOLA_PIECES = 4  # the cubics leave the hyperbola by less than 4e-9 drawn units
 
+Place = tuple[np.ndarray, np.ndarray]  # axes (3, 3) and origin (3,), as `Surface.placed` takes them
 
-def pipe():
+
+def pipe() -> Part:
     """A pipe bent by a right angle between straight ends, walls of 4 pixels: its only edges are the 4 circles there."""
     outer, inner, bend = 0.11, 0.09, 0.4
     places = pipe_frames(0.49, bend, 0.3)
@@ -32,7 +35,7 @@ def pipe():
     return assemble("pipe", surfaces)
 
 
-def pipe_frames(before, bend, after):
+def pipe_frames(before: float, bend: float, after: float) -> list[Place]:
     """Places (axes, origin) along the middle of a pipe, z ahead.
 
     It goes straight up over `before`, a quarter turn of radius `bend` towards x, and straight over `after`.
@@ -47,7 +50,7 @@ def pipe_frames(before, bend, after):
     return [(first, low - before * first[2]), *places, (last, high + after * last[2])]
 
 
-def swept(path, places):
+def swept(path: Path, places: Sequence[Place]) -> Surface:
     """The face that a smooth closed path sweeps from place to place; it has sharp edges at both ends, none along it."""
     ring = lift(np.vstack([path.polygon, path.polygon[:1]]), 0.0)
     rings = np.stack([ring @ axes + origin for axes, origin in places])
@@ -55,7 +58,7 @@ def swept(path, places):
     return Surface(grid_triangles(rings), tuple(ends))
 
 
-def nut():
+def nut() -> Part:
     """A hexagonal nut, both ends chamfered by a cone: 6 lines, 12 hyperbolic arcs, 4 circles.
 
     The cone's rim is as wide as the nut across its flats, so each side meets the cone in an arc that touches the rim.
@@ -74,7 +77,7 @@ def nut():
     return assemble("nut", [*surfaces, wall(end.holes[0], 0.0, height)])
 
 
-def nut_side(apothem, height, slope=np.tan(np.radians(30.0))):
+def nut_side(apothem: float, height: float, slope: float = np.tan(np.radians(30.0))) -> Surface:
     """The side x = apothem of a nut, with its share of both chamfers; of its two vertical edges the right-hand one.
 
     slope: by how much the chamfers fall for each unit outwards.
@@ -90,7 +93,7 @@ def nut_side(apothem, height, slope=np.tan(np.radians(30.0))):
     return Surface(grid_triangles(rows), (low_arc, high_arc, np.stack([low[-1], high[-1]])))
 
 
-def hyperbola_cubics(reach):
+def hyperbola_cubics(reach: float) -> np.ndarray:
     """Cubics (HYPERBOLA_PIECES, 4, 2) of the hyperbola (sinh u, cosh u), u from -reach to reach.
 
     Each has the end points, the tangents and the shoulder of its piece, as `arc` has of the circle; so both are the
@@ -105,7 +108,7 @@ def hyperbola_cubics(reach):
     return np.stack([starts, starts + share * (corners - starts), stops + share * (corners - stops), stops], axis=1)
 
 
-def blade():
+def blade() -> Part:
     """A twisted blade on a block: 12 lines, its outlines at root and tip, and the trailing edge, a space curve.
 
     The leading edge is round, 3 to 5 pixels in radius: a contour and no edge. Both sides are bicubic Bezier patches,
@@ -125,7 +128,7 @@ def blade():
     return assemble("blade", [*surfaces, wall(block.outer, 0.0, foot)])
 
 
-def blade_patches(bottom, top, middle):
+def blade_patches(bottom: float, top: float, middle: np.ndarray) -> np.ndarray:
     """Control points (2, 4, 4, 3) of the two sides: sections from `bottom` to `top`, each from the trailing edge round.
 
     middle: (2,) where the blade stands.

@@ -4,19 +4,20 @@ They are drawn in the units of `profiles`, one unit long. In a view of the defau
 195 pixels long: a pixel spans 0.00461 of the unit cube (217 pixels a unit), which is PIXEL of the drawing.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from taichi_edges.synthetic.free_form import blade, nut, pipe
-from taichi_edges.synthetic.profiles import Path, Profile, circle, line, polygon, rectangle
-from taichi_edges.synthetic.solids import assemble, extrude, revolve
+from taichi_edges.synthetic.profiles import Path, Points, Profile, circle, line, polygon, rectangle
+from taichi_edges.synthetic.solids import Part, assemble, extrude, revolve
 from taichi_edges.synthetic.surfaces import cap, revolved, wall
 
 PIXEL = 0.00512  # drawn units
 
 
-def frame():
+def frame() -> Part:
     """A space frame of square bars, 4.5 pixels wide: 72 lines, of which 24 are as short as the bars are wide."""
     size, bar = np.array([1.0, 0.72, 0.5]), 4.5 * PIXEL
     surfaces = []
@@ -33,7 +34,7 @@ def frame():
     return assemble("frame", surfaces)
 
 
-def shaft():
+def shaft() -> Part:
     """A slim stepped shaft with a taper: 24 circles, 1.5 to 6 pixels apart at steps, grooves, chamfers and a collar."""
     shoulder = [(9, 0), (11, 2), (11, 38), (12.5, 38)]
     groove = [(12.5, 70), (10.5, 70), (10.5, 73), (12.5, 73)]
@@ -43,13 +44,13 @@ def shaft():
     return revolve("shaft", meridian([(0, 0), *shoulder, *groove, *collar, *ring_groove, *tip, (0, 195)]))
 
 
-def meridian(points):
+def meridian(points: Points) -> Path:
     """The path of straight lines through (r, z) `points`, in pixels."""
     points = PIXEL * np.asarray(points, dtype=np.float64)
     return Path(tuple(line(one, other) for one, other in zip(points, points[1:])))
 
 
-def fillet():
+def fillet() -> Part:
     """An angle with one convex and one concave fillet of large radius, both tangent: 16 lines, 4 arcs."""
     outline = polygon(
         [(0, 0), (1, 0), (1, 0.16), (0.4, 0.16), (0.4, 0.66), (0, 0.66)],
@@ -61,7 +62,7 @@ def fillet():
     return assemble("fillet", [surface.placed(lying) for surface in surfaces])
 
 
-def rims():
+def rims() -> Part:
     """A terraced plate with a turned hub, whose rims are 0.5 to 2 pixels apart: 24 lines, 24 arcs, 14 circles.
 
     The plate's terraces are 2 and 1 pixels high. The hub has steps of 1.5 and 0.5 pixels, a groove 1 pixel wide and a
@@ -80,7 +81,7 @@ def rims():
     return assemble("rims", [*surfaces, revolved(hub, middle)])
 
 
-def grille():
+def grille() -> Part:
     """A thin plate with bowed rows of slanted and round openings, bars of 6 pixels between: 156 lines, 12 circles.
 
     No corners of openings lie in one line: the triangulation would leave the middle ones out.
@@ -98,7 +99,7 @@ def grille():
     return extrude("grille", Profile(outline, (*slots, *holes)), 10 * PIXEL)
 
 
-HARD_PARTS = {
+HARD_PARTS: dict[str, Callable[[], Part]] = {
     "frame": frame,
     "shaft": shaft,
     "pipe": pipe,

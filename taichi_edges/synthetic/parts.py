@@ -1,10 +1,13 @@
 """The parts themselves. `PARTS[name]()` makes one."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from taichi_edges.synthetic.hard_parts import HARD_PARTS
 from taichi_edges.synthetic.profiles import (
     Path,
+    Point,
     Profile,
     circle,
     corner_arc,
@@ -16,17 +19,17 @@ from taichi_edges.synthetic.profiles import (
     slot,
 )
 from taichi_edges.synthetic.solids import Part, assemble, extrude, revolve
-from taichi_edges.synthetic.surfaces import cap, pierced, wall
+from taichi_edges.synthetic.surfaces import Surface, cap, pierced, wall
 
 __all__ = ["PARTS", "Part", "extrude", "revolve"]
 
 
-def block():
+def block() -> Part:
     """A plain box: 12 lines."""
     return extrude("block", Profile(rectangle((0, 0), (0.9, 0.7))), 0.5)
 
 
-def bracket():
+def bracket() -> Part:
     """An angle with a rounded bend and a round hole in each leg: 16 lines, 8 arcs and circles."""
     thick, width, long, tall = 0.13, 0.55, 0.9, 0.7
     outline = polygon(
@@ -43,7 +46,7 @@ def bracket():
     return assemble("bracket", [surface.placed(lying) for surface in surfaces])
 
 
-def side_at(path, point):
+def side_at(path: Path, point: Point) -> int:
     """Index of the straight segment of a path that passes through `point`."""
     for index, segment in enumerate(path.segments):
         start, end = segment.flat[0], segment.flat[-1]
@@ -53,7 +56,7 @@ def side_at(path, point):
     raise ValueError(f"no straight side passes through {point}")
 
 
-def bored(path, near, far, width, radius):
+def bored(path: Path, near: Point, far: Point, width: float, radius: float) -> list[Surface]:
     """Two parallel flat sides of an extruded path and the round hole from one to the other, at half the width.
 
     near, far: (2,) points in which the hole's axis meets the two sides.
@@ -70,13 +73,13 @@ def bored(path, near, far, width, radius):
     return surfaces + [wall(hole.reversed(), -depth, 0.0).placed(*frame)]
 
 
-def wave():
+def wave() -> Part:
     """A block whose back is one free-form cubic: 10 lines, 2 curves."""
     back = curve([(0.9, 0.35), (0.6, 0.95), (0.35, 0.05), (0.0, 0.55)])
     return extrude("wave", Profile(join([line((0, 0), (0.9, 0)), back])), 0.35)
 
 
-def knob():
+def knob() -> Part:
     """A turned knob with a free-form grip: 5 circles, and wide smooth surfaces that have contours but no edges."""
     grip = curve([(0.24, 0.14), (0.10, 0.34), (0.16, 0.52), (0.38, 0.56)])
     points = [(0, 0), (0.42, 0), (0.42, 0.14), (0.24, 0.14)]
@@ -85,7 +88,7 @@ def knob():
     return revolve("knob", Path((*lines, grip, line((0.38, 0.56), (0.38, 0.62)), top)))
 
 
-def demo():
+def demo() -> Part:
     """A cam plate: free-form side, fillets, a chamfered hub, a slot, a hole, a leaf-shaped rib: 35 edges."""
     foot, rib_top, hub_top = 0.14, 0.24, 0.36
     outline = demo_outline()
@@ -109,7 +112,7 @@ def demo():
     return assemble("demo", surfaces)
 
 
-def demo_outline():
+def demo_outline() -> Path:
     """The outline of the demo's plate: two fillets, two sharp corners, one free-form side."""
     left, right = (0.0, 0.0), (1.0, 0.0)
     high_right, high_left = (1.0, 0.55), (0.0, 0.72)
@@ -123,4 +126,11 @@ def demo_outline():
     )
 
 
-PARTS = {"block": block, "bracket": bracket, "wave": wave, "knob": knob, "demo": demo, **HARD_PARTS}
+PARTS: dict[str, Callable[[], Part]] = {
+    "block": block,
+    "bracket": bracket,
+    "wave": wave,
+    "knob": knob,
+    "demo": demo,
+    **HARD_PARTS,
+}

@@ -1,5 +1,8 @@
 """Posed views of a part: cameras on rings, edge maps and shaded pictures."""
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import cv2
 import numpy as np
 
@@ -8,6 +11,11 @@ from taichi_edges.synthetic.visibility import ray_scene, sample_contours, sample
 from taichi_edges.views.cameras import project
 from taichi_edges.views.light import light_of_srgb, srgb_of_light
 from taichi_edges.views.views import Views
+
+if TYPE_CHECKING:
+    from open3d.t.geometry import RaycastingScene
+
+    from taichi_edges.synthetic.solids import Part
 
 __all__ = ["Imperfections", "render_edge_maps", "render_pictures", "render_views", "ring_cameras"]
 
@@ -28,7 +36,9 @@ GLOOM = 0.4  # how much darker the floor of the cube is than its middle; sets pa
 SUPERSAMPLING = 2  # rays along each side of a pixel of the pictures
 
 
-def ring_cameras(view_count, image_size, elevations=ELEVATIONS, field_of_view=FIELD_OF_VIEW):
+def ring_cameras(
+    view_count: int, image_size: int, elevations: Sequence[float] = ELEVATIONS, field_of_view: float = FIELD_OF_VIEW
+) -> tuple[np.ndarray, np.ndarray]:
     """Cameras evenly around the unit cube, on one ring for each elevation in turn, looking at its centre, z upwards.
 
     image_size: pixels, width and height. elevations, field_of_view: degrees. The whole cube is in every view.
@@ -48,7 +58,7 @@ def ring_cameras(view_count, image_size, elevations=ELEVATIONS, field_of_view=FI
     return np.repeat(intrinsics[None], view_count, axis=0), poses
 
 
-def look_at(centre, target):
+def look_at(centre: np.ndarray, target: np.ndarray) -> np.ndarray:
     """(3, 4) world_to_camera of a camera at `centre` that looks at `target`, the world's z upwards in the picture."""
     forward = (target - centre) / np.linalg.norm(target - centre)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -57,18 +67,20 @@ def look_at(centre, target):
     return np.column_stack([rotation, -rotation @ centre])
 
 
-def camera_centre(world_to_camera):
+def camera_centre(world_to_camera: np.ndarray) -> np.ndarray:
     """(3,) position of a camera in the world."""
     return -world_to_camera[:, :3].T @ world_to_camera[:, 3]
 
 
-def pixel_size(intrinsics, world_to_camera):
+def pixel_size(intrinsics: np.ndarray, world_to_camera: np.ndarray) -> float:
     """World units that a pixel spans at the centre of the cube, in the view where they are the fewest."""
     depths = (world_to_camera[:, :, :3] @ CUBE_CENTRE + world_to_camera[:, :, 3])[:, 2]
     return float((depths / intrinsics[:, 0, 0]).min())
 
 
-def render_views(part, view_count, image_size, imperfections, generator):
+def render_views(
+    part: "Part", view_count: int, image_size: int, imperfections: Imperfections, generator: np.random.Generator
+) -> tuple[Views, np.ndarray]:
     """Edge maps and pictures of a part from `ring_cameras`.
 
     image_size: pixels, width and height. generator: numpy.random.Generator, of which the imperfections draw.
@@ -81,7 +93,14 @@ def render_views(part, view_count, image_size, imperfections, generator):
     return views, render_pictures(part, *cameras, image_size)
 
 
-def render_edge_maps(part, intrinsics, world_to_camera, image_size, imperfections, generator):
+def render_edge_maps(
+    part: "Part",
+    intrinsics: np.ndarray,
+    world_to_camera: np.ndarray,
+    image_size: int,
+    imperfections: Imperfections,
+    generator: np.random.Generator,
+) -> np.ndarray:
     """(V, H, W) uint8 edge maps of a part from given cameras (V, 3, 3) and (V, 3, 4)."""
     scene = ray_scene(part)
     spacing = SAMPLE_PX * pixel_size(intrinsics, world_to_camera)
@@ -98,13 +117,15 @@ def render_edge_maps(part, intrinsics, world_to_camera, image_size, imperfection
     return edge_maps
 
 
-def render_pictures(part, intrinsics, world_to_camera, image_size):
+def render_pictures(part: "Part", intrinsics: np.ndarray, world_to_camera: np.ndarray, image_size: int) -> np.ndarray:
     """(V, H, W, 3) uint8 RGB shaded pictures on white."""
     scene = ray_scene(part)
     return np.stack([render_picture(part, scene, *camera, image_size) for camera in zip(intrinsics, world_to_camera)])
 
 
-def render_picture(part, scene, lens, pose, image_size):
+def render_picture(
+    part: "Part", scene: "RaycastingScene", lens: np.ndarray, pose: np.ndarray, image_size: int
+) -> np.ndarray:
     """(H, W, 3) uint8 RGB: one shaded picture on white. A pixel holds the mean light over its area, as in a camera."""
     fine = image_size * SUPERSAMPLING
     steps = (np.arange(fine, dtype=np.float32) + 0.5) / SUPERSAMPLING - 0.5  # pixel centres at integers
@@ -125,14 +146,14 @@ def render_picture(part, scene, lens, pose, image_size):
     return np.rint(255.0 * srgb_of_light(picture)).astype(np.uint8)
 
 
-def interpolated_normals(part, triangles, barycentric):
+def interpolated_normals(part: "Part", triangles: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
     """(n, 3) unit normals at points of triangles (n,), given by the weights (n, 2) of the second and third corner."""
     weights = np.column_stack([1.0 - barycentric.sum(axis=1), barycentric])
     normals = np.einsum("nc,nck->nk", weights, part.corner_normals[triangles])
     return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
-def shade(normals, heights):
+def shade(normals: np.ndarray, heights: np.ndarray) -> np.ndarray:
     """(n, 3) unit normals and (n,) heights in the cube -> (n, 3) RGB in 0..1.
 
     The lamps are soft: their light wraps half-way round the back of the part.

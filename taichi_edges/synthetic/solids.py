@@ -1,5 +1,6 @@
 """Part: a closed triangle mesh with its exact sharp edges, and how faces are put together into one."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -8,8 +9,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from taichi_edges.geometry.edge_set import EdgeSet
-from taichi_edges.synthetic.profiles import SHARP_ANGLE
-from taichi_edges.synthetic.surfaces import cap, revolved, wall
+from taichi_edges.synthetic.profiles import SHARP_ANGLE, Path, Profile
+from taichi_edges.synthetic.surfaces import Surface, cap, revolved, wall
 
 LONGEST_SIDE = 0.9  # of the bounding box, in the unit cube
 WELD = 9  # decimals: vertices that agree to so many are one; faces that meet agree to rounding errors (1e-16)
@@ -45,14 +46,14 @@ class Part:
     edges: EdgeSet
 
     @cached_property
-    def normals(self):
+    def normals(self) -> np.ndarray:
         """(m, 3) unit normals of the triangles."""
         a, b, c = np.moveaxis(self.vertices[self.triangles], 1, 0)
         normals = np.cross(b - a, c - a)
         return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
     @cached_property
-    def mesh_edges(self):
+    def mesh_edges(self) -> MeshEdges:
         """MeshEdges of the part."""
         ends, sides = pair_edges(self.triangles)
         normals = self.normals[sides]
@@ -61,7 +62,7 @@ class Part:
         return MeshEdges(ends, sides, normals, sharp, np.einsum("ek,ek->e", beyond, normals[:, 0]) < 0)
 
     @cached_property
-    def corner_normals(self):
+    def corner_normals(self) -> np.ndarray:
         """(m, 3, 3) normal of the smooth surface at each corner of each triangle; it breaks at sharp edges only."""
         ends, sides = (array[~self.mesh_edges.sharp] for array in (self.mesh_edges.ends, self.mesh_edges.sides))
         # Corners of two triangles at one vertex belong together where the edge between the triangles is smooth.
@@ -75,14 +76,14 @@ class Part:
         return (sums / np.linalg.norm(sums, axis=1, keepdims=True))[groups].reshape(-1, 3, 3)
 
 
-def corner_angles(corners):
+def corner_angles(corners: np.ndarray) -> np.ndarray:
     """(m, 3, 3) corners -> (m, 3) inner angles: weights that make vertex normals independent of the triangulation."""
     onward = np.roll(corners, -1, axis=1) - corners
     back = np.roll(corners, 1, axis=1) - corners
     return np.arctan2(np.linalg.norm(np.cross(onward, back), axis=2), (onward * back).sum(axis=2))
 
 
-def pair_edges(triangles):
+def pair_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The edges of a closed mesh: (e, 2) vertices and (e, 2) triangles, the first of which runs along the edge.
 
     Raises ValueError where an edge has not exactly two triangles of opposite direction.
@@ -98,9 +99,9 @@ def pair_edges(triangles):
     return directed[0::2], owner.reshape(-1, 2)
 
 
-def distinct_edges(surfaces):
+def distinct_edges(surfaces: Sequence[Surface]) -> EdgeSet:
     """The exact edges of all faces, each once: two faces that meet both bring the edge, perhaps run backwards."""
-    found = {}
+    found: dict[tuple[float, ...], np.ndarray] = {}
     for edge in (edge for surface in surfaces for edge in surface.edges):
         points = edge.reshape(-1, 3)
         # First and second moments do not depend on the direction, nor on where a full circle starts.
@@ -117,14 +118,14 @@ def distinct_edges(surfaces):
     )
 
 
-def assemble(name, surfaces):
+def assemble(name: str, surfaces: Sequence[Surface]) -> Part:
     """A Part of the faces `surfaces`, which must close, scaled into the unit cube and centred in it."""
     corners = np.concatenate([surface.triangles for surface in surfaces])
     vertices, indices = weld(corners.reshape(-1, 3))
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     scale = LONGEST_SIDE / (high - low).max()
 
-    def into_cube(points):
+    def into_cube(points: np.ndarray) -> np.ndarray:
         return (points - (low + high) / 2.0) * scale + 0.5
 
     part = Part(name, into_cube(vertices), indices.reshape(-1, 3), distinct_edges(surfaces).transformed(into_cube))
@@ -132,18 +133,18 @@ def assemble(name, surfaces):
     return part
 
 
-def weld(points):
+def weld(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(n, 3) -> the distinct points (k, 3) and the (n,) index of each."""
     _, first, indices = np.unique(np.round(points, WELD) + 0.0, axis=0, return_index=True, return_inverse=True)
     return points[first], indices.reshape(-1)
 
 
-def extrude(name, profile, height):
+def extrude(name: str, profile: Profile, height: float) -> Part:
     """A profile swept upwards."""
     caps = [cap(profile, 0.0, upward=False), cap(profile, height, upward=True)]
     return assemble(name, caps + [wall(path, 0.0, height) for path in profile.paths])
 
 
-def revolve(name, path):
+def revolve(name: str, path: Path) -> Part:
     """An (r, z) path turned about the vertical axis: closed off the axis, or open with both its ends on the axis."""
     return assemble(name, [revolved(path)])

@@ -4,11 +4,13 @@ Every face brings its triangles, oriented outwards, and the exact sharp edges on
 bring the same vertices and the same edges; `solids.assemble` welds the former and keeps one of the latter.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from taichi_edges.synthetic.profiles import Profile, circle, rectangle
+from taichi_edges.synthetic.profiles import Path, Point, Profile, circle, rectangle
 
 
 @dataclass(frozen=True)
@@ -16,20 +18,20 @@ class Surface:
     """triangles: (m, 3, 3) corners. edges: tuple of (2, 3) lines and (k, 4, 3) cubics of one smooth curve each."""
 
     triangles: np.ndarray
-    edges: tuple = ()
+    edges: tuple[np.ndarray, ...] = ()
 
-    def placed(self, axes, origin=(0.0, 0.0, 0.0)):
+    def placed(self, axes: ArrayLike, origin: ArrayLike = (0.0, 0.0, 0.0)) -> "Surface":
         """Moved: local x, y, z along the rows of `axes` (3, 3, a rotation), local zero to `origin`."""
         axes, origin = np.asarray(axes, dtype=np.float64), np.asarray(origin, dtype=np.float64)
         return Surface(self.triangles @ axes + origin, tuple(edge @ axes + origin for edge in self.edges))
 
 
-def lift(points, height):
+def lift(points: np.ndarray, height: float) -> np.ndarray:
     """(..., 2) points of the plane -> (..., 3) at a height z."""
     return np.concatenate([points, np.full((*points.shape[:-1], 1), float(height))], axis=-1)
 
 
-def grid_triangles(points):
+def grid_triangles(points: np.ndarray) -> np.ndarray:
     """Two triangles for each cell of an (r, c, 3) grid, facing columns x rows; cells of no area are left out."""
     a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
     triangles = np.concatenate([np.stack([a, b, c], axis=-2), np.stack([a, c, d], axis=-2)]).reshape(-1, 3, 3)
@@ -37,7 +39,7 @@ def grid_triangles(points):
     return triangles[np.linalg.norm(normals, axis=1) > 1e-12]
 
 
-def cap(profile, height, upward):
+def cap(profile: Profile, height: float, upward: bool) -> Surface:
     """The flat face inside `profile` at a height. Its border edges come with the walls that end there."""
     import mapbox_earcut
 
@@ -53,7 +55,7 @@ def cap(profile, height, upward):
     return Surface(lift(corners, height))
 
 
-def wall(path, bottom, top, top_path=None, skip=()):
+def wall(path: Path, bottom: float, top: float, top_path: Path | None = None, skip: Sequence[int] = ()) -> Surface:
     """The face swept by a closed path from the height `bottom` up to `top`.
 
     top_path: a path of the same make-up, where the wall leans (drafts, chamfers). skip: indices of straight segments
@@ -73,7 +75,9 @@ def wall(path, bottom, top, top_path=None, skip=()):
     return Surface(np.concatenate(triangles), tuple(edges))
 
 
-def pierced(path, index, bottom, top, holes):
+def pierced(
+    path: Path, index: int, bottom: float, top: float, holes: Sequence[Path]
+) -> tuple[Surface, tuple[np.ndarray, np.ndarray]]:
     """The flat wall face over segment `index` of a path, with holes in it.
 
     holes: Paths in the face's own plane: x along the segment from its start, y up from `bottom`.
@@ -88,7 +92,7 @@ def pierced(path, index, bottom, top, holes):
     return face.placed(*frame), frame
 
 
-def revolved(path, centre=(0.0, 0.0)):
+def revolved(path: Path, centre: Point = (0.0, 0.0)) -> Surface:
     """The face swept by an (r, z) path turned about the vertical axis through `centre`.
 
     A circle is a sharp edge where the path has a sharp joint or an open end off the axis.

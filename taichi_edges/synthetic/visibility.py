@@ -1,11 +1,17 @@
 """Which samples of a part's edges a camera sees: hidden-line removal by ray casting, and occluding contours."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from taichi_edges.geometry.bezier import evaluate_bezier
+
+if TYPE_CHECKING:
+    from open3d.t.geometry import RaycastingScene
+
+    from taichi_edges.synthetic.solids import Part
 
 # A sample is lifted off the surface by so much (world units) before its ray to the camera is cast. It must exceed the
 # distance between exact edge and mesh (CHORD_ERROR, 5e-5) and the rounding of float32 rays (1e-6); it shifts the point
@@ -27,7 +33,7 @@ class LineSamples:
     chains: np.ndarray
     strokes: np.ndarray
 
-    def joined(self, other):
+    def joined(self, other: "LineSamples") -> "LineSamples":
         """These samples and the others, whose chains and strokes are renumbered."""
         return LineSamples(
             np.concatenate([self.points, other.points]),
@@ -37,7 +43,7 @@ class LineSamples:
         )
 
 
-def ray_scene(part):
+def ray_scene(part: "Part") -> "RaycastingScene":
     """The part's mesh, ready for rays (Open3D RaycastingScene; its primitive ids are the part's triangles)."""
     import open3d
 
@@ -46,7 +52,7 @@ def ray_scene(part):
     return scene
 
 
-def sample_segments(starts, ends, spacing):
+def sample_segments(starts: np.ndarray, ends: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """Points at most `spacing` apart on (s, 3) straight segments, both ends included.
 
     Returns points (n, 3) and (n,) the index of the segment.
@@ -58,23 +64,22 @@ def sample_segments(starts, ends, spacing):
     return (1.0 - fractions) * starts[owners] + fractions * ends[owners], owners
 
 
-def sample_edges(part, spacing):
+def sample_edges(part: "Part", spacing: float) -> LineSamples:
     """Samples of the exact sharp edges, at most `spacing` (world units) apart."""
     edges = part.edges
-    points, chains = sample_segments(edges.lines[:, 0], edges.lines[:, 1], spacing)
-    points, chains = [points], [chains]
+    places, numbers = ([array] for array in sample_segments(edges.lines[:, 0], edges.lines[:, 1], spacing))
     for piece, control_points in enumerate(edges.curves):
         # |B'| <= 3 max|side of the control polygon|, so equal steps of t keep the spacing.
         longest = np.linalg.norm(np.diff(control_points, axis=0), axis=1).max()
         count = max(int(np.ceil(3.0 * longest / spacing)), 1) + 1
-        points.append(evaluate_bezier(control_points, np.linspace(0.0, 1.0, count)))
-        chains.append(np.full(count, len(edges.lines) + piece))
-    points, chains = np.concatenate(points), np.concatenate(chains)
+        places.append(evaluate_bezier(control_points, np.linspace(0.0, 1.0, count)))
+        numbers.append(np.full(count, len(edges.lines) + piece))
+    points, chains = np.concatenate(places), np.concatenate(numbers)
     sources = np.concatenate([edges.line_sources, edges.curve_sources])
     return LineSamples(points, outward_directions(part, points, spacing), chains, sources[chains])
 
 
-def outward_directions(part, points, spacing):
+def outward_directions(part: "Part", points: np.ndarray, spacing: float) -> np.ndarray:
     """(n, 3) mean normal of the two faces that meet at the sharp mesh edge nearest to each of the (n, 3) points."""
     mesh = part.mesh_edges
     ends = part.vertices[mesh.ends[mesh.sharp]]
@@ -83,13 +88,13 @@ def outward_directions(part, points, spacing):
     return middle_direction(mesh.normals[mesh.sharp][owners[nearest]])
 
 
-def middle_direction(normals):
+def middle_direction(normals: np.ndarray) -> np.ndarray:
     """(n, 2, 3) unit normals -> (n, 3) the unit direction half-way between the two."""
     total = normals.sum(axis=1)
     return total / np.linalg.norm(total, axis=1, keepdims=True)
 
 
-def sample_contours(part, centre, spacing):
+def sample_contours(part: "Part", centre: np.ndarray, spacing: float) -> LineSamples:
     """Samples of the occluding contours seen from `centre` (3,): mesh edges inside a smooth surface at which it turns
     away from the camera.
 
@@ -106,7 +111,7 @@ def sample_contours(part, centre, spacing):
     return LineSamples(points, middle_direction(mesh.normals[turning])[chains], chains, np.zeros_like(chains))
 
 
-def visible_from(scene, samples, centre):
+def visible_from(scene: "RaycastingScene", samples: LineSamples, centre: np.ndarray) -> np.ndarray:
     """(n,) bool: is the way from each sample to the camera centre (3,) free?"""
     origins = samples.points + LIFT * samples.outward
     rays = np.concatenate([origins, centre - origins], axis=1).astype(np.float32)
