@@ -19,7 +19,7 @@ setup: $(VENV)/ready
 	@sh tools/system-libraries $(RUN)
 
 # Reinstalled only when the requirements change.
-$(VENV)/ready: requirements.lock setup.cfg pyproject.toml
+$(VENV)/ready: requirements.lock setup.cfg setup.py pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if (3, 10) <= v <= (3, 12) else "Python 3.10 to 3.12 is needed, $(PYTHON) is %d.%d: make PYTHON=python3.12" % v)'
 	@$(PYTHON) -m venv $(VENV) || { echo "the venv module is missing; on Debian and Ubuntu: sudo apt-get install python3-venv"; exit 1; }
 	$(RUN) -m pip install --quiet --disable-pip-version-check --requirement requirements.lock

@@ -3,12 +3,13 @@
 import contextlib
 import os
 import platform
-import resource
 import sys
 from importlib.metadata import version
 from pathlib import Path
 
-MIB = 1024.0 * 1024.0
+import psutil
+
+from taichi_edges.corridor.machine import MIB, available_threads
 
 
 def machine_line():
@@ -27,36 +28,9 @@ def _cpu_model():
     return platform.processor() or platform.machine()
 
 
-def available_threads():
-    """Threads that this process may use: what run.py takes when nobody says otherwise."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def peak_memory_mib():
-    """Peak resident memory of this process in MiB, since its start or the last `reset_peak_memory`."""
-    with contextlib.suppress(OSError):
-        return _status_mib("VmHWM")  # of this program alone; ru_maxrss takes over the peak of whoever started it
-    return maxrss_mib(resource.getrusage(resource.RUSAGE_SELF))
-
-
 def memory_mib():
-    """Resident memory of this process now, in MiB; NaN where the system does not say."""
-    with contextlib.suppress(OSError):
-        return _status_mib("VmRSS")
-    return float("nan")
-
-
-def reset_peak_memory():
-    """Start the peak anew (Linux; elsewhere it stays that of the whole process)."""
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
-
-
-def _status_mib(key):
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith(f"{key}:"):
-            return int(line.split()[1]) / 1024.0
-    raise OSError(f"/proc/self/status has no {key}")
+    """Resident memory of this process now, in MiB."""
+    return psutil.Process().memory_info().rss / MIB
 
 
 def maxrss_mib(usage):

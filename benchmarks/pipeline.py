@@ -18,10 +18,11 @@ import numpy as np
 if not __package__:  # run as a script: the project's root takes the place of this folder
     sys.path[0] = str(Path(__file__).resolve().parent.parent)
 
-from benchmarks.machine import available_threads, benchmark_cache, compiled_kernels, machine_line, maxrss_mib
+from benchmarks.machine import benchmark_cache, compiled_kernels, machine_line, maxrss_mib
 from benchmarks.markdown import table
-from taichi_edges.corridor.command import with_reader
-from taichi_edges.corridor.pipeline import STAGES, Run
+from taichi_edges.corridor.machine import available_threads
+from taichi_edges.corridor.pipeline import Run, with_reader
+from taichi_edges.corridor.stages import STAGES
 from taichi_edges.errors import UserError
 from taichi_edges.scene.scene_file import load_scene
 
@@ -65,7 +66,7 @@ def missing_data(scene, data_root):
     """Why a scene cannot run here, or None."""
     try:
         run = Run(load_scene(str(scene), data_root=data_root), Path("nowhere"), data_root)
-        run = with_reader(run) if run.config.source.reader == "auto" else run
+        run = with_reader(run)
         for stage in STAGES.values():
             stage.outside(run)
     except UserError as error:

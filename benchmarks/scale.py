@@ -16,9 +16,10 @@ import numpy as np
 if not __package__:  # run as a script: the project's root takes the place of this folder
     sys.path[0] = str(Path(__file__).resolve().parent.parent)
 
-from benchmarks.machine import available_threads, benchmark_cache, machine_line, peak_memory_mib, reset_peak_memory
+from benchmarks.machine import benchmark_cache, machine_line
 from benchmarks.markdown import table
 from benchmarks.scaling import slope_text
+from taichi_edges.corridor.machine import available_threads, peak_memory_mib, reset_peak_memory
 from taichi_edges.geometry.shapes import EllipticArc, Line
 from taichi_edges.kernels.device import start_taichi
 from taichi_edges.refinement.stage import refine_wireframe

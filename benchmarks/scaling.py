@@ -19,17 +19,9 @@ if not __package__:  # run as a script: the project's root takes the place of th
     sys.path[0] = str(Path(__file__).resolve().parent.parent)
 
 from benchmarks.log_plot import Curve, Panel, draw_panels
-from benchmarks.machine import (
-    MIB,
-    available_threads,
-    benchmark_cache,
-    compiled_kernels,
-    machine_line,
-    memory_mib,
-    peak_memory_mib,
-    reset_peak_memory,
-)
+from benchmarks.machine import benchmark_cache, compiled_kernels, machine_line, memory_mib
 from benchmarks.markdown import table
+from taichi_edges.corridor.machine import MIB, available_threads, peak_memory_mib, reset_peak_memory
 
 ROOT = Path(__file__).resolve().parent.parent
 AXES = {"gaussians": "Gaussians", "views": "views", "pixels": "width of a square view, pixels"}

@@ -15,7 +15,7 @@ if not __package__:  # run as a script: the project's root takes the place of th
 
 from benchmarks.edge_scene import make_scene, scatter_gaussians
 from benchmarks.floor import Floor, FloorMissing, assert_same, compile_floor
-from benchmarks.machine import available_threads, machine_line
+from benchmarks.machine import machine_line
 from benchmarks.markdown import table
 from benchmarks.twin import load_twin, random_direction, splat_slopes, time_twin
 from benchmarks.view_step import (
@@ -29,6 +29,7 @@ from benchmarks.view_step import (
     start,
     time_round,
 )
+from taichi_edges.corridor.machine import available_threads
 from taichi_edges.synthetic.rendering import pixel_size
 
 TWIN_REPEATS = 3

@@ -19,10 +19,11 @@ import numpy as np
 if not __package__:  # run as a script: the project's root takes the place of this folder
     sys.path[0] = str(Path(__file__).resolve().parent.parent)
 
-from benchmarks.machine import available_threads, benchmark_cache, machine_line
+from benchmarks.machine import benchmark_cache, machine_line
 from benchmarks.markdown import table
 from benchmarks.pipeline import ROOT, missing_data
 from taichi_edges.corridor import cluster, evaluate, fit
+from taichi_edges.corridor.machine import available_threads
 from taichi_edges.corridor.pipeline import Run, run_stages
 from taichi_edges.evidence.edge_support import support_along
 from taichi_edges.evidence.edgel_matching import EdgelMatching

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 class UserError(Exception):
     """A mistake in the input. Its text is one line: where (file, key, view), what is wrong, what to do.
 
-    `run.py` prints it without a traceback and exits with status 2. What it quotes (a key, a file name, another
+    The command prints it without a traceback and exits with status 2. What it quotes (a key, a file name, another
     library's message) may hold line breaks; they become spaces.
     """
 
@@ -19,6 +19,13 @@ def did_you_mean(name: object, known: Iterable[object]) -> str:
     """'; did you mean 'position'?' for the known name nearest to `name`, or '' where none is near."""
     near = difflib.get_close_matches(str(name), [str(k) for k in known], n=1, cutoff=0.5)
     return f"; did you mean '{near[0]}'?" if near else ""
+
+
+def refuse_unknown(option: str, value: object, what: str, known: Iterable[str]) -> None:
+    """UserError where the value of an option is none of those known. what: 'stage'. None is no value, and passes."""
+    if value is not None and value not in known:
+        hint = f"there is {', '.join(known)}{did_you_mean(value, known)}"
+        raise UserError(f"{option} {value}: there is no such {what}; {hint}")
 
 
 def name_some(names: Iterable[object], most: int = 5) -> str:

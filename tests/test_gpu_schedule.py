@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from paper_training import paper_training
 from reference_splatting import (
     INSIDE,
     MOSTLY_EDGES,
@@ -28,7 +29,6 @@ from scipy.spatial import cKDTree
 from test_gradients import assert_gradients, gradients, random_neighbors
 
 from taichi_edges.progress import Progress
-from taichi_edges.scene.settings import DensityConfig, TrainConfig
 from taichi_edges.splatting.gaussians import start_gaussians
 from taichi_edges.splatting.training import Training
 from taichi_edges.synthetic.parts import PARTS
@@ -323,8 +323,8 @@ def trained(start_taichi, seed):
     generator = np.random.default_rng(seed)
     on = edges[generator.choice(len(edges), 500, replace=False)] + generator.normal(size=(500, 3)) * PIXEL / 2
     start = start_gaussians(np.concatenate([on, generator.random((200, 3))]), generator, 0.01, 0.08)
-    density = DensityConfig(duplicate_at=[], cull_support_at=[0.5], cull_opacity_at=[0.8])
-    config = TrainConfig(
+    density = {"duplicate_at": [], "cull_support_at": [0.5], "cull_opacity_at": [0.8]}
+    config = paper_training(
         epochs=0, steps=60, only_means=0.2, regularize_from=0.6, regularize_every=4, density=density, settled=0.0
     )
     known = {}

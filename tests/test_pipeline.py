@@ -5,6 +5,7 @@ really dead.
 """
 
 import csv
+import errno
 import json
 import os
 import re
@@ -28,6 +29,7 @@ from taichi_edges.corridor.findings import FINDINGS
 from taichi_edges.corridor.pipeline import STAGES, Run, run_stages
 from taichi_edges.errors import UserError
 from taichi_edges.exporters.point_cloud import read_oriented_points
+from taichi_edges.files import artefacts
 from taichi_edges.files.artefacts import digest_file, remove_unfinished, replacing
 from taichi_edges.files.splats import read_gaussians
 from taichi_edges.geometry.edge_set import EdgeSet, read_edges, write_edges
@@ -821,6 +823,21 @@ def test_the_lock_of_a_dead_run_is_taken_over(copied, holder):
     holder.wait()
     _, said = rerun(copied)
     assert said.states() == states([], STAGES)
+
+
+@pytest.mark.parametrize(("number", "holds"), [(errno.ENOLCK, True), (errno.EIO, False)])
+def test_a_file_system_that_knows_no_locks_is_no_obstacle(tmp_path, monkeypatch, number, holds):
+    def fail(descriptor, blocking):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(artefacts, "lock_descriptor", fail)
+    if holds:
+        with artefacts.locked(tmp_path):
+            assert (tmp_path / ".lock").read_text() == f" {os.getpid()}\n"
+        assert (tmp_path / ".lock").read_text() == ""
+    else:
+        with pytest.raises(OSError, match=os.strerror(number)):
+            artefacts.locked(tmp_path).__enter__()
 
 
 def test_show_without_a_display_is_refused_before_anything_is_done(tmp_path):

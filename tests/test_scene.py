@@ -64,6 +64,20 @@ def test_the_paper_preset_has_the_numbers_of_the_supplement():
     assert (train["strength_weight"], train["flanks_from"]) == (0.0, 1.0)
 
 
+def test_the_defaults_are_what_a_scene_without_settings_gets(scene):
+    assert load_scene(scene()) == SceneConfig(source={"reader": "synthetic", "part": "block"}, name="scene")
+    assert SceneConfig.model_fields["preset"].default == "fast" and SceneConfig.model_fields["scale"].default == "part"
+
+
+def test_a_preset_on_the_command_line_replaces_every_value_of_the_other(scene):
+    def keys(values):
+        return {key: keys(below) if isinstance(below, dict) else None for key, below in values.items()}
+
+    assert keys(PRESETS["fast"]) == keys(PRESETS["paper"])
+    resolved = scene(yaml.safe_dump(load_scene(scene(), preset="paper").model_dump()), base="", name="resolved.yaml")
+    assert load_scene(resolved, preset="fast") == load_scene(scene())
+
+
 def test_clustering_and_fitting_start_from_the_supplement(scene):
     config = load_scene(scene())
     assert config.cluster.theta == 0.8 and config.fit.delta == 0.5
@@ -250,7 +264,8 @@ def test_a_folder_is_a_scene_without_keys(tmp_path):
 
 
 def test_a_missing_scene_is_named_with_its_nearest_neighbour(tmp_path, scene):
-    assert "No such file or directory; the scenes that come along are in scenes/" in refusal(tmp_path / "bolt.yaml")
+    message = refusal(tmp_path / "bolt.yaml")
+    assert "No such file or directory; scenes that come along: abc_00000006, " in message and ", demo, " in message
     scene(name="nut.yaml")
     assert "did you mean 'nut.yaml'?" in refusal(tmp_path / "nutt.yaml")
 

@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from paper_training import paper_training
 from scipy.spatial import cKDTree
 
 from taichi_edges.detectors.ridges import trace_ridges
 from taichi_edges.errors import UserError
 from taichi_edges.evidence.support import line_width
 from taichi_edges.progress import Progress
-from taichi_edges.scene.settings import DensityConfig, LearningRates, TrainConfig
+from taichi_edges.scene.settings import LearningRates
 from taichi_edges.seeding.starts import random_points
 from taichi_edges.splatting.density import Population, cull_opacity, cull_support, duplicate
 from taichi_edges.splatting.gaussians import Gaussians, logit, start_gaussians
@@ -176,7 +177,7 @@ def test_the_last_neighbour_repeats_where_there_are_too_few(generator, count):
 )
 def test_learning_rates_are_the_supplements(epoch, means):
     others = (2e-4, 1e-3, 3e-2) if epoch >= 30 else (0.0, 0.0, 0.0)  # positions only for 30 epochs
-    assert rates(TrainConfig(), epoch / 500) == pytest.approx((means, *others))
+    assert rates(paper_training(), epoch / 500) == pytest.approx((means, *others))
 
 
 def test_the_loss_has_settled_when_two_passes_hardly_lower_it():
@@ -194,8 +195,8 @@ def test_the_loss_has_settled_when_two_passes_hardly_lower_it():
 
 @pytest.mark.parametrize("settled, end", [(1.0, 60 + 3 * 12), (0.0, 240)])
 def test_a_run_ends_early_only_when_nothing_more_is_scheduled(start_taichi, block, settled, end):
-    density = DensityConfig(duplicate_at=[], cull_opacity_at=[0.25], cull_support_at=[], min_opacity=0.0)
-    config = TrainConfig(
+    density = {"duplicate_at": [], "cull_opacity_at": [0.25], "cull_support_at": [], "min_opacity": 0.0}
+    config = paper_training(
         epochs=0, steps=240, gaussians=300, regularize_from=0.0, regularize_every=1000, density=density
     )
     config = config.model_copy(update={"settled": settled})
@@ -211,10 +212,14 @@ def test_flanks_spare_established_edges_but_no_strays(
     """The mask is made anew after every cull by support; a Gaussian without support of its own has no say in it."""
     views, edges = block
     start_taichi("f32", 2)
-    density = DensityConfig(
-        duplicate_at=[], cull_opacity_at=[0.6], cull_support_at=[0.25, 0.75], min_support=0.0, reset_opacity=False
-    )
-    config = TrainConfig(
+    density = {
+        "duplicate_at": [],
+        "cull_opacity_at": [0.6],
+        "cull_support_at": [0.25, 0.75],
+        "min_support": 0.0,
+        "reset_opacity": False,
+    }
+    config = paper_training(
         epochs=0, steps=24, density=density, flanks_from=0.5, established_support=least, regularize_from=1.0
     )
     rates = {"means": 0.0, "scales": 0.0, "opacities": 0.0, "quaternions": 0.0}
@@ -235,8 +240,8 @@ def test_flanks_spare_established_edges_but_no_strays(
 
 
 def test_no_end_before_the_regularizers_have_begun(start_taichi, block):
-    density = DensityConfig(duplicate_at=[], cull_opacity_at=[], cull_support_at=[])
-    config = TrainConfig(epochs=0, steps=120, settled=1.0, gaussians=300, regularize_from=0.75, density=density)
+    density = {"duplicate_at": [], "cull_opacity_at": [], "cull_support_at": []}
+    config = paper_training(epochs=0, steps=120, settled=1.0, gaussians=300, regularize_from=0.75, density=density)
     _, _, records = train(start_taichi, block, config)
     assert records[-1].step == 90
 
@@ -244,21 +249,21 @@ def test_no_end_before_the_regularizers_have_begun(start_taichi, block):
 def test_maps_without_any_edge_pixel_are_refused(start_taichi, block):
     views = replace(block[0], edge_maps=np.zeros_like(block[0].edge_maps))
     with pytest.raises(UserError, match="none of the 12 edge maps has an edge pixel"):
-        train(start_taichi, (views, None), TrainConfig(gaussians=300))
+        train(start_taichi, (views, None), paper_training(gaussians=300))
 
 
 @pytest.mark.parametrize("loss, visited", [("balanced", 7), ("whole_image", 12)])
 def test_an_epoch_is_one_pass_over_the_views_that_say_something(start_taichi, block, loss, visited):
     edge_maps = block[0].edge_maps.copy()
     edge_maps[7:] = 0
-    config = TrainConfig(epochs=3, gaussians=300, loss=loss, density=DensityConfig(duplicate_at=[]))
+    config = paper_training(epochs=3, gaussians=300, loss=loss, density={"duplicate_at": []})
     _, _, records = train(start_taichi, (replace(block[0], edge_maps=edge_maps), None), config)
     assert records[-1].step == 3 * visited
 
 
 @pytest.mark.parametrize("steps, total", [(5, 12), (30, 30)])
 def test_every_view_is_seen_at_least_once(start_taichi, block, steps, total):
-    config = TrainConfig(epochs=0, steps=steps, gaussians=300, density=DensityConfig(duplicate_at=[]))
+    config = paper_training(epochs=0, steps=steps, gaussians=300, density={"duplicate_at": []})
     _, _, records = train(start_taichi, block, config)
     assert records[-1].step == total
 
@@ -278,8 +283,8 @@ def train(start_taichi, block, config):
 
 def test_training_finds_the_edges_of_a_block(start_taichi, block):
     """A short schedule with everything in it: positions alone, duplication, culls, regularisers."""
-    density = DensityConfig(duplicate_at=[0.4, 0.55], cull_opacity_at=[0.75], cull_support_at=[0.7])
-    config = TrainConfig(
+    density = {"duplicate_at": [0.4, 0.55], "cull_opacity_at": [0.75], "cull_support_at": [0.7]}
+    config = paper_training(
         epochs=65,
         gaussians=300,
         initial_scale=0.01,
@@ -306,13 +311,13 @@ def test_flanks_bring_the_centres_onto_the_lines(start_taichi, block):
     views, edges = block
     views, medians = replace(views, edge_maps=redrawn(views)), []
     fast = {"means_decay": 0.84, "means_decay_every": 0.05, "means_decays": 20, "only_means": 0.1}
-    rates = LearningRates(means=2e-3, scales=5e-3, opacities=3e-2, quaternions=5e-3)
-    density = DensityConfig(duplicate_at=[], cull_opacity_at=[], cull_support_at=[])
+    rates = {"means": 2e-3, "scales": 5e-3, "opacities": 3e-2, "quaternions": 5e-3}
+    density = {"duplicate_at": [], "cull_opacity_at": [], "cull_support_at": []}
     for share in (1.0, 0.5):
         start_taichi("f32", 2)
         generator = np.random.default_rng(1)
         beside = edges[generator.choice(len(edges), 600)] + generator.normal(size=(600, 3)) * PIXEL
-        config = TrainConfig(epochs=0, steps=240, density=density, flanks_from=share, learning_rates=rates, **fast)
+        config = paper_training(epochs=0, steps=240, density=density, flanks_from=share, learning_rates=rates, **fast)
         training = Training(views, config, generator, threads=2)
         trained, _ = training.run(start_gaussians(beside, generator, 0.01, 0.3), Progress())
         assert (trained.opacities > 0.2).sum() > 500
@@ -327,9 +332,9 @@ def redrawn(views):
 
 
 def test_the_same_seed_trains_the_same_gaussians(start_taichi, block):
-    density = DensityConfig(duplicate_at=[0.5], cull_opacity_at=[], cull_support_at=[0.75])
+    density = {"duplicate_at": [0.5], "cull_opacity_at": [], "cull_support_at": [0.75]}
     schedule = {"only_means": 0.4, "regularize_from": 0.6, "regularize_every": 3, "flanks_from": 0.5}
-    config = TrainConfig(epochs=8, gaussians=1500, density=density, established_support=0.1, **schedule)
+    config = paper_training(epochs=8, gaussians=1500, density=density, established_support=0.1, **schedule)
     runs = [train(start_taichi, block, config) for _ in range(2)]
     for one, other in zip(vars(runs[0][1]).values(), vars(runs[1][1]).values()):
         assert one.tobytes() == other.tobytes()

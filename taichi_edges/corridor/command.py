@@ -1,37 +1,19 @@
-"""What `run.py` does with its options: load the scene, run the corridor, print the summary, show the window."""
+"""What the command does with its options: run the corridor, print the summary, show the window."""
 
-import os
 import sys
-from dataclasses import replace
-from pathlib import Path
 
-from taichi_edges.corridor.pipeline import STAGES, Run, expand, run_stages
+from taichi_edges.corridor.pipeline import run_stages
+from taichi_edges.corridor.reconstruction import open_run, stages_until
+from taichi_edges.corridor.stages import STAGES
 from taichi_edges.errors import UserError
-from taichi_edges.files.artefacts import read_facts
-from taichi_edges.progress import make_progress
-from taichi_edges.scene.scene_file import is_source, load_scene
-
-MOST_THREADS = 256  # each has a plane of its own to draw into
 
 
 def run_command(options):
     """Run what the parsed command line `options` asks for; mistakes of the user raise UserError."""
-    data_root = _data_root(options.data)
-    config = load_scene(options.scene, options.preset, options.set, options.seed, options.scale, data_root)
     if options.show:
         _refuse_vain_show(options.until)
-    run = Run(
-        config=config,
-        folder=Path(options.out) / config.name,
-        data_root=data_root,
-        threads=_threads(options.threads),
-        arch=options.arch,
-        progress=make_progress(options.quiet),
-    )
-    if config.source.reader == "auto":
-        run = with_reader(run)
-    if is_source(Path(options.scene)):
-        _refuse_results_of_another(run)
+    names = ("out", "data", "preset", "scale", "seed", "threads", "arch", "quiet")
+    run = open_run(options.scene, options.set, **{name: getattr(options, name) for name in names})
     record = run_stages(run, options.stage, options.until)
     print_summary(run, record, options.until)
     if options.show:
@@ -49,58 +31,9 @@ def _refuse_vain_show(until):
         raise UserError(f"{problem}; run without it and open edges.ply, edges.step or overlays.png")
 
 
-def with_reader(run):
-    """The run with the reader that fits what is at its source.path; says which it is."""
-    from taichi_edges.readers.recognition import recognised_source
-
-    path = run.data_path(run.config.source.path, "source.path")
-    source, found = recognised_source(path, run.config.source)
-    run.progress.say(f"{path}: read as {found}")
-    return replace(run, config=run.config.model_copy(update={"source": source}))
-
-
-def _refuse_results_of_another(run):
-    """UserError where the run's folder holds the results of another source: folders in two places may be called alike.
-
-    Only where the name is the folder's; in a scene file the user has chosen it.
-    """
-    try:
-        scene = read_facts(run.path("run.json"))["scene"]
-        before, name = Path(scene["source"]["path"]), scene["name"]
-    except (KeyError, TypeError):
-        return
-    before = before if before.is_absolute() else (run.data_root or Path()) / before
-    if name == run.config.name and before.resolve() != Path(run.config.source.path).resolve():
-        problem = f"holds the results of {before}"
-        raise UserError(f"{run.folder}: {problem}; name others with --out FOLDER or --set name=NAME, or delete it")
-
-
-def _data_root(option):
-    """The folder of --data, or else of TAICHI_EDGES_DATA; None where neither is given."""
-    origin, data = ("--data", option) if option else ("TAICHI_EDGES_DATA", os.environ.get("TAICHI_EDGES_DATA"))
-    if not data:
-        return None
-    folder = expand(data, origin)
-    if not folder.is_dir():
-        raise UserError(f"{origin}: {data} is not a folder; name the folder that holds the scenes' data")
-    return folder.resolve()
-
-
-def _threads(wanted):
-    """Threads to use: what the user wants, or all that this process may use."""
-    if wanted is None:
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if not 1 <= wanted <= MOST_THREADS:
-        bound = "at least 1" if wanted < 1 else f"at most {MOST_THREADS}"
-        raise UserError(f"--threads {wanted}: must be {bound}")
-    return wanted
-
-
 def print_summary(run, record, until=None):
     """The metrics and the time of every stage, as two tables (plain lines where the output is not a terminal)."""
-    names = list(STAGES)
-    done = [name for name in names[: names.index(until) + 1 if until else None] if name in record["stages"]]
-    rows = []
+    done, rows = stages_until(record, until), []
     for name in done:
         stage = record["stages"][name]
         seconds = f"{stage['seconds']:.1f} s" + ("" if name in record["ran"] else " (earlier)")

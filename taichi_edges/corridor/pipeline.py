@@ -1,4 +1,4 @@
-"""The corridor: which stages there are, what each reads and writes, and when a stage may be skipped.
+"""The corridor: stage after stage of the table `stages`, and when a stage may be skipped.
 
 `run.json` records for every finished stage a fingerprint of all it depended on (settings, input files, seed, threads,
 versions) and the digests of what it wrote. A stage whose fingerprint and outputs still match is skipped; a stage the
@@ -16,10 +16,8 @@ import errno
 import functools
 import os
 import platform
-import resource
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -27,9 +25,10 @@ from pathlib import Path
 import yaml
 
 import taichi_edges
-from taichi_edges.corridor import cluster, evaluate, export, fit, prepare, refine, sources, train
 from taichi_edges.corridor.findings import FINDINGS
-from taichi_edges.errors import UserError
+from taichi_edges.corridor.machine import available_threads, peak_memory_mib, reset_peak_memory
+from taichi_edges.corridor.stages import STAGES, function_of
+from taichi_edges.errors import UserError, refuse_unknown
 from taichi_edges.files.artefacts import (
     digest,
     digest_file,
@@ -39,8 +38,12 @@ from taichi_edges.files.artefacts import (
     write_json,
     write_text,
 )
-from taichi_edges.progress import Progress
+from taichi_edges.progress import Progress, make_progress
+from taichi_edges.scene.paths import data_folder, expand
+from taichi_edges.scene.settings import SceneConfig
 
+ARCHS = ("cpu", "cuda", "vulkan")
+MOST_THREADS = 256  # each has a plane of its own to draw into
 STAGE_KEYS = {"seconds", "peak_memory_mib", "fingerprint", "inputs", "outputs", "facts"}
 DISK_TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR)
 # What the result of any stage may depend on; a stage that uses another package names it.
@@ -48,83 +51,37 @@ PACKAGES = ("taichi", "numpy", "scipy", "opencv-python-headless", "open3d", "ope
 
 
 @dataclass(frozen=True)
-class Stage:
-    """One stage of the corridor.
-
-    sections: the keys of the scene its result depends on ('a.b' reaches into a section). reads: artefacts of earlier
-    stages. writes: its own. outside: function of the Run that lists the input files it reads beyond those, and raises
-    UserError where the scene names one that is not there. on_device: whether threads and arch matter to its result.
-    packages: those beyond PACKAGES whose version matters to it.
-    """
-
-    function: Callable
-    sections: tuple
-    reads: tuple
-    writes: tuple
-    outside: Callable = lambda run: []
-    on_device: bool = False
-    packages: tuple = ()
-
-
-STAGES = {
-    "prepare": Stage(
-        prepare.prepare,
-        ("source", "calibration", "box", "seed", "train.edge_threshold", "evaluation.held_out"),
-        (),
-        ("views.npz", "held_out.npz"),
-        sources.source_files,
-        packages=("pycolmap",),
-    ),
-    "train": Stage(
-        train.train,
-        ("train", "seed"),
-        ("views.npz",),
-        ("gaussians.ply", "train_log.csv"),
-        sources.seed_files,
-        on_device=True,
-    ),
-    "cluster": Stage(
-        cluster.cluster,
-        ("filter", "cluster", "train.edge_threshold", "seed"),
-        ("gaussians.ply", "views.npz"),
-        ("points.ply", "clusters.npz"),
-        on_device=True,
-    ),
-    "fit": Stage(fit.fit, ("fit", "name", "seed"), ("clusters.npz", "views.npz"), ("edges_fit.json",)),
-    "refine": Stage(
-        refine.refine, ("refine", "seed"), ("edges_fit.json", "views.npz"), ("edges.json",), on_device=True
-    ),
-    "evaluate": Stage(
-        evaluate.evaluate,
-        ("evaluation",),
-        ("edges.json", "views.npz", "held_out.npz"),
-        ("metrics.json", "metrics.csv"),
-        sources.truth_files,
-    ),
-    "export": Stage(
-        export.export,
-        (),
-        ("edges.json", "views.npz"),
-        ("overlays.png",),
-        sources.picture_files,
-        packages=("ezdxf",),
-    ),
-}
-
-
-@dataclass(frozen=True)
 class Run:
     """One scene on its way through the corridor.
 
-    folder: where all artefacts go. data_root: where relative paths of the scene start, or None.
+    folder: where all artefacts go; made where it is not there. data_root: where relative paths of the scene start, or
+    None. threads: of the CPU. arch: where the kernels run, one of ARCHS.
     """
 
-    config: object
+    config: SceneConfig
     folder: Path
-    data_root: Path | None = None
-    threads: int = 1
-    arch: str = "cpu"
-    progress: Progress = field(default_factory=Progress)
+    data_root: Path | None
+    threads: int
+    arch: str
+    progress: Progress
+
+    def __init__(self, config, folder, data_root=None, threads=None, arch="cpu", progress=None):
+        """Paths may be strings. data_root: None for that of TAICHI_EDGES_DATA, where it is set. threads: None for all
+        that this process may use. progress: None for what the command shows; a plain Progress() is silent.
+        """
+        threads = available_threads() if threads is None else threads
+        if not 1 <= threads <= MOST_THREADS:
+            bound = "at least 1" if threads < 1 else f"at most {MOST_THREADS}"
+            raise UserError(f"--threads {threads}: must be {bound}")
+        refuse_unknown("--arch", arch, "device", ARCHS)
+        vars(self).update(
+            config=config,
+            folder=expand(folder, "--out"),
+            data_root=data_folder(data_root),
+            threads=threads,
+            arch=arch,
+            progress=progress or make_progress(),
+        )
 
     def path(self, name):
         """An artefact's path."""
@@ -149,12 +106,16 @@ class Run:
         return path
 
 
-def expand(text, origin):
-    """A path as the user wrote it, with `~` replaced; `origin` is where it was written, for the message."""
-    try:
-        return Path(text).expanduser()
-    except RuntimeError as error:
-        raise UserError(f"{origin}: {text}: '~' and what follows it name no user; write the path out") from error
+def with_reader(run):
+    """The run with the reader that fits what is at its source.path, where the scene names none; says which it is."""
+    if run.config.source.reader != "auto":
+        return run
+    from taichi_edges.readers.recognition import recognised_source
+
+    path = run.data_path(run.config.source.path, "source.path")
+    source, found = recognised_source(path, run.config.source)
+    run.progress.say(f"{path}: read as {found}")
+    return replace(run, config=run.config.model_copy(update={"source": source}))
 
 
 def run_stages(run, start=None, until=None):
@@ -164,6 +125,9 @@ def run_stages(run, start=None, until=None):
     lists the stages that were not skipped.
     """
     names = list(STAGES)
+    refuse_unknown("--stage", start, "stage", names)
+    refuse_unknown("--until", until, "stage", names)
+    run = with_reader(run)
     first = names.index(start) if start else 0
     last = names.index(until) if until else len(names) - 1
     if first > last:
@@ -317,15 +281,15 @@ def _run_stage(run, record, name, force):
         run.progress.say(f"{name}: up to date ({known['seconds']:.1f} s when it ran)")
         return
     run.progress.say(f"{name} again ({stale[0]}: {stale[1]})" if known and stale else f"{name} ...")
-    _reset_peak_memory()
+    reset_peak_memory()
     started = time.perf_counter()
     try:
         inputs = _inputs(run, stage)
-        facts = stage.function(run)
+        facts = function_of(name)(run)
         outputs = [*stage.writes, *facts.get("files", [])]
         record["stages"][name] = {
             "seconds": round(time.perf_counter() - started, 3),
-            "peak_memory_mib": round(_peak_memory_mib(), 1),
+            "peak_memory_mib": round(peak_memory_mib(), 1),
             "fingerprint": digest(inputs),
             "inputs": inputs,
             "outputs": {artefact: digest_file(run.path(artefact)) for artefact in outputs},
@@ -339,19 +303,3 @@ def _run_stage(run, record, name, force):
         problem = f"{error.strerror} in the {name} stage"
         raise UserError(f"{error.filename or run.folder}: {problem}; put that right and repeat the command") from error
     run.progress.say(f"{name}: {FINDINGS[name](facts)} ({record['stages'][name]['seconds']:.1f} s)")
-
-
-def _reset_peak_memory():
-    """Start the peak anew (Linux; elsewhere the peak is that of the whole process so far)."""
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
-
-
-def _peak_memory_mib():
-    """Peak resident memory in MiB since the last reset."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 1024
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1024 * 1024 if platform.system() == "Darwin" else 1024)

@@ -107,7 +107,7 @@ def _inside_the_run(run, views):
 
 
 def _lies_in(path, folder):
-    return os.path.commonpath([os.path.abspath(path), os.path.abspath(folder)]) == os.path.abspath(folder)
+    return Path(os.path.abspath(path)).is_relative_to(os.path.abspath(folder))
 
 
 def _refuse_needless_calibration(run, detector):

@@ -3,13 +3,15 @@
 import contextlib
 import csv
 import errno
-import fcntl
 import functools
 import hashlib
 import io
 import json
 import os
 from pathlib import Path
+
+import psutil
+from filelock import lock_descriptor
 
 from taichi_edges.errors import UserError
 
@@ -35,22 +37,18 @@ def locked(folder):
     """Nobody else writes into `folder` meanwhile; UserError where another run does so now.
 
     The system gives the lock up when its process ends, however it ends. The file stays: were it removed, a third
-    process might lock a new one beside a second that still holds the old.
+    process might lock a new one beside a second that still holds the old. Its first byte is blank, for Windows lets
+    nobody read the byte that is locked.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / LOCK, "a+", encoding="utf-8") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            file.seek(0)
+        if not _is_ours(file):
+            file.seek(1)
             owner = file.read().strip() or "unknown"
             problem = f"another run, process {owner}, is writing into this folder"
-            raise UserError(f"{folder}: {problem}; wait for it, or choose another folder with --out") from error
-        except OSError as error:
-            if error.errno not in NO_LOCKS:
-                raise
+            raise UserError(f"{folder}: {problem}; wait for it, or choose another folder with --out")
         file.truncate(0)
-        file.write(f"{os.getpid()}\n")
+        file.write(f" {os.getpid()}\n")
         file.flush()
         try:
             yield
@@ -58,25 +56,23 @@ def locked(folder):
             file.truncate(0)
 
 
+def _is_ours(file):
+    """Lock an open file; False where another process has. What cannot be locked counts as ours."""
+    try:
+        return lock_descriptor(file.fileno(), blocking=False)
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+        return True
+
+
 def remove_unfinished(folder):
     """Delete the temporary files that a killed run has left below `folder`; those of a living process stay."""
     for path in Path(folder).rglob(".*.unfinished*"):
         process = path.name.partition(".unfinished")[0].rpartition(".")[2]
-        if process.isdigit() and not _is_alive(int(process)):
+        # Our own number is that of a dead process, too: nothing of this run has been written yet.
+        if process.isdigit() and (int(process) == os.getpid() or not psutil.pid_exists(int(process))):
             path.unlink(missing_ok=True)
-
-
-def _is_alive(process):
-    """Is there a process of this number? Our own does not count: what it writes now is not there yet."""
-    if process == os.getpid():
-        return False
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True  # it belongs to someone else
-    return True
 
 
 def write_text(path, text):

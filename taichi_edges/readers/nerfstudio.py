@@ -5,7 +5,7 @@ pixel is (0.5, 0.5), as in COLMAP. `applied_transform` and `applied_scale` say h
 poses, points (`ply_file_path`), box and everything exported are in the frame of the file as it is.
 """
 
-import os
+import posixpath
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
@@ -71,12 +71,12 @@ def _file_path(frame: Any, where: Path) -> PurePosixPath:
     name = frame.get("file_path") if isinstance(frame, dict) else None
     if not isinstance(name, str) or not PurePosixPath(name).name:
         raise UserError(f"{where}: a frame without file_path; every frame names its image")
-    return PurePosixPath(os.path.normpath(name.replace("\\", "/")))
+    return PurePosixPath(posixpath.normpath(name.replace("\\", "/")))
 
 
 def _below_their_folder(paths: list[PurePosixPath]) -> list[str]:
     """(V,) the paths below the folder that all of them share, as edge maps and masks are named."""
-    shared = os.path.commonpath([path.parent for path in paths]) if len({p.is_absolute() for p in paths}) == 1 else ""
+    shared = posixpath.commonpath([path.parent for path in paths]) if len({p.is_absolute() for p in paths}) == 1 else ""
     return [str(path.relative_to(shared)) if shared else str(path) for path in paths]
 
 

@@ -1,17 +1,19 @@
 """Scene files: one YAML file = one scene.
 
 Unknown and mistyped keys are refused by name. Precedence: defaults < preset < scale < scene file < `--preset` and
-`--scale` given on the command line < `--set key=value`. A folder in place of a scene file is a scene without keys.
+`--scale` given on the command line < `--set key=value`. A folder in place of a scene file is a scene without keys; the
+name of a scene that comes along stands for its file.
 """
 
 import difflib
 import re
-from pathlib import Path
+from collections.abc import Mapping
 
 import yaml
 from pydantic import ValidationError
 
-from taichi_edges.errors import UserError, did_you_mean
+from taichi_edges.errors import UserError, did_you_mean, refuse_unknown
+from taichi_edges.scene.paths import data_folder, expand, scene_path, shipped_scenes
 from taichi_edges.scene.presets import PRESETS, SCALES, SCALES_OF_READERS
 from taichi_edges.scene.settings import SceneConfig, Section
 
@@ -78,28 +80,27 @@ def overlay(base, over):
 
 
 def load_scene(path, preset=None, settings=(), seed=None, scale=None, data_root=None):
-    """Read and check a scene: a YAML file, or a folder of photographs or of a layout that the readers know.
+    """Read and check a scene: a YAML file, the name of one that comes along, or a folder that the readers know.
 
     preset, scale: override the scene's, and the scene's own values where they name them.
-    settings: 'key.subkey=value' strings, YAML values. seed: overrides the scene's.
-    data_root: folder in which a relative source.path starts, None without; a scene that names no scale gets that of
-    the layout found there.
+    settings: 'key.subkey=value' strings, YAML values; or a dict of values and sections by key, such as
+    {"train.steps": 300, "fit": {"delta": 0.3}}. seed: overrides the scene's.
+    data_root: folder in which a relative source.path starts, None for that of TAICHI_EDGES_DATA; a scene that names no
+    scale gets that of the layout found there. Returns the SceneConfig.
     """
-    path = Path(path)
+    path = scene_path(path)
     content = _folder_content(path) if is_source(path) else _file_content(path)
-    _refuse_unknown("preset", preset, PRESETS)
-    _refuse_unknown("scale", scale, SCALES)
-    parsed = [(*_parse_setting(setting), setting) for setting in settings]
+    refuse_unknown("--preset", preset, "preset", PRESETS)
+    refuse_unknown("--scale", scale, "scale", SCALES)
+    parsed = _parse_settings(settings)
     if scale is None and "scale" not in content:
         content |= _scale_of_source({**_section(content), **_settings_of_source(parsed)}, data_root)
     content = overlay(_starting_values(preset or content.get("preset"), scale or content.get("scale")), content)
     content = _overridden(content, preset, scale)
     origins = {}
-    for keys, value, setting in parsed:
-        origins[keys] = f"--set {setting}"
-        for name in reversed(keys):
-            value = {name: value}
-        content = overlay(content, value)
+    for keys, value, origin in parsed:
+        origins[keys] = origin
+        content = overlay(content, _nested(keys, value))
     if seed is not None:
         content["seed"] = seed
         origins[("seed",)] = f"--seed {seed}"
@@ -113,8 +114,18 @@ def _section(content):
 
 
 def _settings_of_source(parsed):
-    """The keys of the section `source` that the command line sets. parsed: (keys, value, text) of every `--set`."""
-    return {keys[1]: value for keys, value, _ in parsed if len(keys) == 2 and keys[0] == "source"}
+    """The keys of the section `source` that settings name. parsed: (keys, value, origin) of each."""
+    found = {}
+    for keys, value, _ in parsed:
+        found |= _section(_nested(keys, value))
+    return found
+
+
+def _nested(keys, value):
+    """('train', 'steps'), 300 -> {'train': {'steps': 300}}."""
+    for name in reversed(keys):
+        value = {name: value}
+    return value
 
 
 def _scale_of_source(source, data_root):
@@ -133,11 +144,14 @@ def _recognised_reader(text, data_root):
     if not isinstance(text, str) or not text:
         return None
     try:
-        path = Path(text).expanduser()
-        if not path.is_absolute() and data_root is None:
-            return None
-        return recognise(path if path.is_absolute() else Path(data_root) / path).reader
-    except (UserError, OSError, RuntimeError, ValueError):
+        path = expand(text, "source.path")
+        if not path.is_absolute():
+            data_root = data_folder(data_root)
+            if data_root is None:
+                return None
+            path = data_root / path
+        return recognise(path).reader
+    except (UserError, OSError, ValueError):
         return None
 
 
@@ -179,11 +193,6 @@ def _starting_values(preset, scale):
     return overlay(PRESETS[preset], of_scale.get(preset, {}))
 
 
-def _refuse_unknown(option, value, known):
-    if value is not None and value not in known:
-        raise UserError(f"--{option} {value}: there is no such {option}; there is {', '.join(known)}")
-
-
 def _overridden(content, preset, scale):
     """The scene with the preset and the scale of the command line, where there are any, over its own values."""
     of_scale = scale or content.get("scale")
@@ -197,22 +206,40 @@ def _overridden(content, preset, scale):
 
 
 def _why_unreadable(path, error):
-    """What is wrong with a scene's path; a scene of a similar name in the same folder is named."""
-    elsewhere = "; the scenes that come along are in scenes/"
-    near = did_you_mean(path.name, [p.name for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else [])
-    return f"{error.strerror}{near or elsewhere}"
+    """What is wrong with a scene's path; a scene of such a name that comes along or lies in the same folder is named."""
+    shipped = shipped_scenes()
+    if path.stem in shipped:
+        return f"{error.strerror}; for the scene that comes along give its name alone: {path.stem}"
+    known = [p.name for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
+    near = did_you_mean(path.name, known) or did_you_mean(path.stem, shipped)
+    return f"{error.strerror}{near or '; scenes that come along: ' + ', '.join(shipped)}"
+
+
+def _parse_settings(settings):
+    """[(keys, value, origin)]: (('train', 'steps'), 300, '--set train.steps=300'). settings: as `load_scene` takes."""
+    if not isinstance(settings, Mapping):
+        return [_parse_setting(setting) for setting in settings]
+    parsed = [(tuple(key.split(".")), value, f"{key}={value!r}") for key, value in settings.items()]
+    for keys, value, origin in parsed:
+        _refuse_bundle(keys, value, origin)
+    return parsed
 
 
 def _parse_setting(setting):
-    """'train.epochs=100' -> (('train', 'epochs'), 100)."""
+    """'train.epochs=100' -> (('train', 'epochs'), 100, '--set train.epochs=100')."""
     key, equals, value = setting.partition("=")
-    keys = tuple(key.strip().split("."))
+    keys, origin = tuple(key.strip().split(".")), f"--set {setting}"
     if not equals or not all(keys):
-        raise UserError(f"--set {setting}: write key=value, e.g. --set train.epochs=100")
+        raise UserError(f"{origin}: write key=value, e.g. --set train.epochs=100")
+    _refuse_bundle(keys, value, origin)
+    return keys, parse_yaml(value, f"--set {key.strip()}"), origin
+
+
+def _refuse_bundle(keys, value, origin):
+    """UserError where a setting is a preset or a scale."""
     if keys in (("preset",), ("scale",)):
         option = keys[0]
-        raise UserError(f"--set {setting}: a {option} brings many values with it; use --{option}{value and ' '}{value}")
-    return keys, parse_yaml(value, f"--set {key.strip()}")
+        raise UserError(f"{origin}: a {option} brings many values with it; use --{option}{value and ' '}{value}")
 
 
 def check_scene(content, where, origins=None):

@@ -1,6 +1,7 @@
 """SceneConfig: what a scene consists of. Every key has its unit, its default and its meaning here.
 
-`scene_file` reads a scene from YAML.
+The defaults are the preset `fast` for a part. `presets` holds what another preset or scale sets otherwise; `scene_file`
+reads a scene from YAML.
 """
 
 from typing import Annotated, Literal
@@ -123,69 +124,69 @@ class CalibrationConfig(Section):
 
 
 class LearningRates(Section):
-    """Adam's rates (supplement, "Training")."""
+    """Adam's rates."""
 
-    means: NotNegative = Field(1e-3, description="unit-cube units per step")
-    scales: NotNegative = Field(2e-4, description="of the logarithm, per step")
+    means: NotNegative = Field(2e-3, description="unit-cube units per step")
+    scales: NotNegative = Field(5e-3, description="of the logarithm, per step")
     opacities: NotNegative = Field(3e-2, description="of the logit, per step")
-    quaternions: NotNegative = Field(1e-3, description="per step")
+    quaternions: NotNegative = Field(5e-3, description="per step")
 
 
 class DensityConfig(Section):
     """Culling and duplication "at regular intervals" (supplement): the shares of the run after which they happen."""
 
-    duplicate_at: list[Share] = Field([n / 50 for n in range(4, 17)], description="shares of the run")
+    duplicate_at: list[Share] = Field([], description="shares of the run")
     duplicate_gradient: Share = Field(0.5, description="relative positional gradient from which on to duplicate")
     duplicate_copies: Annotated[int, Field(ge=0)] = Field(2, description="copies of each")
     duplicate_distance: NotNegative = Field(0.01, description="standard deviation of a copy's offset, unit-cube units")
     max_gaussians: Count = Field(50_000, description="no duplication beyond this number")
-    cull_opacity_at: list[Share] = Field([0.25, 0.62, 0.9], description="shares of the run")
+    cull_opacity_at: list[Share] = Field([0.7], description="shares of the run")
     min_opacity: Share = Field(0.05, description="Gaussians below are culled")
-    cull_support_at: list[Share] = Field([0.2, 0.3, 0.4, 0.5, 0.7, 0.9], description="shares of the run")
+    cull_support_at: list[Share] = Field([0.5, 0.75], description="shares of the run")
     min_support: Share = Field(0.05, description="share of the views whose edge pixels a centre must hit")
-    reset_opacity: bool = Field(True, description="opacities down to the initial one after a cull")
+    reset_opacity: bool = Field(False, description="opacities down to the initial one after a cull")
 
 
 class TrainConfig(Section):
     """Training of the Gaussians (paper 3.1, 3.2, supplement).
 
-    A run is as long as `epochs` or `steps` says; when things happen in it is written in shares of the run. The defaults
-    here are the paper's; a scene file starts from the values of its preset.
+    A run is as long as `epochs` or `steps` says; when things happen in it is written in shares of the run. Seeded where
+    the views agree, a few passes are enough: fast rates, one smooth decay, no duplication.
     """
 
-    epochs: Annotated[int, Field(ge=0)] = Field(500, description="passes over all views; 0: train.steps counts")
-    steps: Annotated[int, Field(ge=0)] = Field(0, description="view steps, at least one pass; 0: train.epochs counts")
+    epochs: Annotated[int, Field(ge=0)] = Field(0, description="passes over all views; 0: train.steps counts")
+    steps: Annotated[int, Field(ge=0)] = Field(500, description="view steps, at least one pass; 0: train.epochs counts")
     settled: Share = Field(
-        0.0, description="stop when the last two passes lowered the loss by no more than this share each; 0: never"
+        0.01, description="stop when the last two passes lowered the loss by no more than this share each; 0: never"
     )
-    gaussians: Count = Field(10_000, description="number of random points to start from")
+    gaussians: Count = Field(10_000, description="to start from, at most; random: so many")
     seeds: Literal["auto", "random", "points", "votes", "sweep"] = Field(
-        "auto",
+        "votes",
         description="random points in the box; points: source.points or the model's; votes: where many views agree on"
         " an edge; auto: points as far as there are any, else random",
     )
     initial_scale: Positive = Field(0.004, description="standard deviation, unit-cube units")
-    initial_opacity: Annotated[float, Field(gt=0, lt=1)] = Field(0.08)
+    initial_opacity: Annotated[float, Field(gt=0, lt=1)] = Field(0.3)
     edge_threshold: Annotated[float, Field(gt=0, le=1)] = Field(
         0.5, description="of full scale; from here on a pixel is an edge pixel"
     )
     loss: Literal["balanced", "class_weighted", "whole_image"] = Field("balanced", description="balanced is eq. 3")
     strength_weight: Share = Field(
-        0.0, description="share of an edge pixel's weight in the loss that is its edgel's strength; 0: all weigh alike"
+        0.5, description="share of an edge pixel's weight in the loss that is its edgel's strength; 0: all weigh alike"
     )
     flanks_from: Share = Field(
         1.0, description="share of the run after which the mask takes in the flanks of the lines; 1: never"
     )
     established_support: Share = Field(
-        0.0,
+        0.1,
         description="share of the views that supports an edge, so that where it is hidden, flanks spare it; 0: never",
     )
-    only_means: Share = Field(0.06, description="share of the run that trains positions only")
+    only_means: Share = Field(0.15, description="share of the run that trains positions only")
     learning_rates: LearningRates = LearningRates()
-    means_decay: Positive = Field(0.75, description="factor on the rate of the means")
-    means_decay_every: Positive = Field(0.02, description="share of the run between two decays")
-    means_decays: Annotated[int, Field(ge=0)] = Field(5, description="number of decays")
-    regularize_from: Share = Field(0.6, description="share of the run after which L_orient and L_shape start")
+    means_decay: Positive = Field(0.84, description="factor on the rate of the means")
+    means_decay_every: Positive = Field(0.05, description="share of the run between two decays")
+    means_decays: Annotated[int, Field(ge=0)] = Field(20, description="number of decays")
+    regularize_from: Share = Field(0.5, description="share of the run after which L_orient and L_shape start")
     regularize_every: Count = Field(10, description="steps")
     orient_weight: NotNegative = Field(0.1, description="lambda_1 of eq. 6; 0.01 for large scenes")
     shape_weight: NotNegative = Field(0.1, description="lambda_2 of eq. 6; 0.01 for large scenes")
@@ -212,7 +213,7 @@ class FilterConfig(Section):
     min_support: Share = Field(
         0.05, description="share of the views that see a point and have an edge pixel (refine: edgel) of its own there"
     )
-    refine: bool = Field(False, description="move points to where the viewing planes of their edgels meet")
+    refine: bool = Field(True, description="move points to where the viewing planes of their edgels meet")
     min_views: Positive = Field(3.0, description="refine: views that must show an edge, each counted by its strength")
     min_steadiness: Share = Field(
         0.54, description="refine: share of the unexplained edgels near a point that lie on it, relative to sure edges"
@@ -250,7 +251,7 @@ class FitConfig(Section):
 class RefineConfig(Section):
     """From single edges to a connected wireframe that agrees with the images (beyond the paper)."""
 
-    enabled: bool = Field(False, description="false: the edges stay as they were fitted")
+    enabled: bool = Field(True, description="false: the edges stay as they were fitted")
     min_support: Share = Field(0.0, description="share of the views with an edge in their image that must show it")
     min_views: Positive = Field(2.5, description="views that must show an edge, each counted by its strength")
     min_steadiness: Share = Field(
