@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taichi_edges.arrays.robust import geman_mcclure
+
 LEAST_OBSERVATIONS = 200  # fewer tell nothing
 # px, median; where references agree with edgels no better, as on textured photographs or between thin bars, chance has
 # made the pairs. The scale of a robust fit grows with what it is given, so its standard errors do not tell.
@@ -149,7 +151,7 @@ def _weights(residuals, redescending):
     if not redescending:
         return LEAST_RESIDUAL / np.maximum(sizes, LEAST_RESIDUAL)
     scale = CUT * max(NORMAL_MAD * np.median(sizes), LEAST_RESIDUAL)
-    return 1.0 / (1.0 + (residuals / scale) ** 2) ** 2
+    return geman_mcclure((residuals / scale) ** 2)
 
 
 def _residuals(observations, values, displacements):

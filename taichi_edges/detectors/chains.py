@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+
+from taichi_edges.arrays.components import components
 
 LINK_PX = 1.6  # between edgels next to each other on a chain; they are about 1 px apart
 LINK_COSINE = np.cos(np.radians(25.0))  # between their normals
@@ -44,12 +44,6 @@ def links_between(points, normals, reach):
     cosines = np.abs((normals[first] * normals[second]).sum(axis=1))
     way = points[second] - points[first]
     return first, second, cosines, np.abs([(way * normals[end]).sum(axis=1) for end in (first, second)])
-
-
-def components(count, first, second):
-    """(count,) labels, 0 .. n - 1, of the connected components of a graph with edges from `first` to `second`."""
-    graph = coo_matrix((np.ones(len(first), bool), (first, second)), shape=(count, count))
-    return connected_components(graph, directed=False)[1]
 
 
 def chain_lengths(edgels):

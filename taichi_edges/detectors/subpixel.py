@@ -22,9 +22,8 @@ from itertools import islice
 
 import cv2
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from taichi_edges.arrays.components import components
 from taichi_edges.detectors.ridges import gaussian_derivatives
 from taichi_edges.views.edgels import Edgels
 from taichi_edges.views.pictures import Picture, as_picture, levels_per_light, read_picture
@@ -384,12 +383,10 @@ def _ordered(ahead, behind):
     """(n,) the maxima chain by chain, in order; and, in that order, (n,) the window of each, low .. high - 1."""
     count = len(ahead)
     linked = np.flatnonzero(ahead >= 0)
-    graph = coo_array((np.ones(len(linked), bool), (linked, ahead[linked])), shape=(count, count))
-    chains, labels = connected_components(graph, directed=False)
-    open_chain = np.zeros(chains, bool)
+    labels = components(count, linked, ahead[linked])
+    first = np.unique(labels, return_index=True)[1]
+    open_chain = np.zeros(len(first), bool)
     open_chain[labels[behind < 0]] = True
-    first = np.full(chains, count)
-    np.minimum.at(first, labels, np.arange(count))
     behind = behind.copy()
     behind[first[~open_chain]] = -1  # a closed chain is cut at its first pixel
     ranks = (behind >= 0).astype(np.int64)
@@ -397,7 +394,7 @@ def _ordered(ahead, behind):
         ranks += np.where(behind >= 0, ranks[behind], 0)
         behind = np.where(behind >= 0, behind[behind], -1)
     order = np.lexsort((ranks, labels))
-    ends = np.cumsum(np.bincount(labels, minlength=chains))
+    ends = np.cumsum(np.bincount(labels))
     starts = np.concatenate([[0], ends])[:-1]
     here, label = np.arange(count), labels[order]
     return order, np.maximum(here - WINDOW, starts[label]), np.minimum(here + WINDOW + 1, ends[label])

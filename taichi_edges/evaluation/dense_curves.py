@@ -5,6 +5,8 @@ from functools import cached_property
 
 import numpy as np
 
+from taichi_edges.arrays.ranges import ragged
+
 STEP = 0.0005  # normalised units between the vertices: far less than the radius of any edge that views can resolve
 
 
@@ -90,8 +92,7 @@ def subdivided(polyline):
     if not len(lengths):
         return polyline[:1], np.zeros((1, 3))
     counts = np.ceil(lengths / STEP).astype(np.int64)
-    chord = np.repeat(np.arange(len(lengths)), counts)
-    number = np.arange(len(chord)) - np.repeat(np.cumsum(counts) - counts, counts)
+    chord, number = ragged(counts)
     vertices = starts[chord] + (number / counts[chord])[:, None] * chords[chord]
     directions = (chords / lengths[:, None])[chord]
     return np.concatenate([vertices, polyline[-1:]]), np.concatenate([directions, directions[-1:]])

@@ -9,6 +9,7 @@ import numpy as np
 import taichi as ti
 from scipy.spatial import cKDTree
 
+from taichi_edges.arrays import robust
 from taichi_edges.kernels.device import download, upload
 from taichi_edges.kernels.edgel_grid import CELL, EdgelGrid
 from taichi_edges.kernels.points import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D, blocks_of, load_camera, load_point
@@ -21,6 +22,8 @@ OWNED_BESIDE_PX = 0.5  # and no farther to the side: an edge may run beside anot
 APART = 100.0  # px; views are laid out so far apart when one tree holds the edgels of all of them
 LEAST_VIEWS = 2.5  # of full strength; two planes always meet
 EQUATIONS = 11  # numbers of a point's normal equations, see `add_equations`
+
+geman_mcclure = ti.func(robust.geman_mcclure)
 
 
 class EdgelMatching:
@@ -163,7 +166,7 @@ def add_plane(i, row, pixel, slopes, planes: ti.template(), strength, scale, equ
     normal = ti.Vector([planes[row, 2], planes[row, 3]])
     residual = normal.dot(pixel - ti.Vector([planes[row, 0], planes[row, 1]]))
     slope = normal @ slopes
-    weight = strength / (1.0 + (residual / scale) ** 2) ** 2
+    weight = geman_mcclure((residual / scale) ** 2, strength)
     k = 0
     for a in ti.static(range(3)):
         for b in ti.static(range(a, 3)):

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from taichi_edges.arrays.robust import geman_mcclure
 from taichi_edges.fitting.arcs import FLAT, GAUSS_NEWTON, RIDGE, Arc
 
 
@@ -144,7 +145,7 @@ def fit_batch(arcs, points, directions, of, lever, tolerance, straight, rounds=G
         arcs = ArcBatch(arcs.origin, arcs.tangent, np.zeros_like(arcs.bend), arcs.low, arcs.high, arcs.closed)
     for _ in range(rounds):
         along, offsets = arcs.coordinates(points, of)
-        weights = 1.0 / (1.0 + (offsets**2).sum(axis=1) / tolerance**2) ** 2
+        weights = geman_mcclure((offsets**2).sum(axis=1) / tolerance**2)
         bent, terms = arcs.curvature[of], 2 if straight else 3
         values = np.stack([np.ones_like(along), sine(along, bent), versine(along, bent)][:terms])
         matrix, targets = _moments(values, offsets, weights, of, len(arcs))

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, diags, identity
 from scipy.sparse.linalg import spsolve
 
+from taichi_edges.arrays.robust import widening
 from taichi_edges.evidence.edge_support import SPACING_PX, support_of
 from taichi_edges.geometry.wireframe import Wireframe
 from taichi_edges.refinement.charts import derivatives, moved, nearest_parameters, neighbors, own_unknowns
@@ -338,7 +339,7 @@ def smooth_joints(wireframe):
         values = _turn(end, other_end)
         off = np.linalg.norm(values(*shapes))
         if {shape.kind for shape in shapes} != {"line"} and off < SMOOTH:
-            deviation = SMOOTH_DEVIATION * (1.0 + (off / (3 * SMOOTH_DEVIATION)) ** 2)  # Geman and McClure's weight
+            deviation = SMOOTH_DEVIATION * widening((off / (3 * SMOOTH_DEVIATION)) ** 2)
             yield Constraint((one, other), values, deviation)
 
 

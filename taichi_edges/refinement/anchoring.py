@@ -13,9 +13,10 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from taichi_edges.arrays.ranges import ragged
 from taichi_edges.evidence.edge_support import support_of
 from taichi_edges.geometry.shapes import Line
-from taichi_edges.refinement.anchors import BEYOND_PX, Cameras, anchors_of, ragged
+from taichi_edges.refinement.anchors import BEYOND_PX, Cameras, anchors_of
 from taichi_edges.refinement.straight_runs import LEAST_LENGTH_PX, runs_of
 
 AGREEING_PX = 2.0  # from a line in space, an anchor on it
@@ -196,8 +197,8 @@ class Sight:
     def of(matching, lines, free, spacing):
         """spacing: px. free: (e,) bool, the edgels that count."""
         counts = np.maximum(np.round(lines.lengths / (spacing * lines.sizes)), 4).astype(np.int64)
-        owners = np.repeat(np.arange(len(lines)), counts)
-        share = (ragged(counts) + 0.5) / counts[owners]
+        owners, number = ragged(counts)
+        share = (number + 0.5) / counts[owners]
         parameters = lines.extents[owners, 0] + share * np.diff(lines.extents, axis=1)[owners, 0]
         way = lines.ways[owners]
         points = lines.points[owners, 0] + parameters[:, None] * way

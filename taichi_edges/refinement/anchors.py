@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from taichi_edges.arrays.ranges import ragged
 from taichi_edges.kernels.device import download
 from taichi_edges.views.cameras import NEAR
 
@@ -148,11 +149,7 @@ def near_pairs(runs, pieces, cameras):
 def places_on(runs, chosen):
     """(m, 2) px places on the chosen runs, some beyond their ends, and (m,) the run of each."""
     counts = np.ceil((runs.lengths[chosen] + 2 * BEYOND_PX) / PLACE_PX).astype(np.int64) + 1
-    owners, share = np.repeat(chosen, counts), ragged(counts) / np.repeat(counts - 1, counts)
+    of, number = ragged(counts)
+    owners, share = chosen[of], number / (counts - 1)[of]
     ways = share * (runs.lengths[owners] + 2 * BEYOND_PX) - BEYOND_PX
     return runs.ends[owners, 0] + ways[:, None] * runs.along[owners], owners
-
-
-def ragged(counts):
-    """0 .. c - 1 for each of some counts c, one after the other."""
-    return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from taichi_edges.detectors.chains import components, links_between
+from taichi_edges.arrays.components import components
+from taichi_edges.detectors.chains import links_between
 
 LINKED_PX, LINKED_BESIDE_PX = 1.6, 0.8  # edgels of one 2D edge: apart, to the side
 LINKED_COSINE = np.sqrt(1 - 0.25**2)  # between their normals, 14 degrees

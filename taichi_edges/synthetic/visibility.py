@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from taichi_edges.arrays.ranges import ragged
 from taichi_edges.geometry.bezier import evaluate_bezier
 
 # A sample is lifted off the surface by so much (world units) before its ray to the camera is cast. It must exceed the
@@ -52,8 +53,7 @@ def sample_segments(starts, ends, spacing):
     Returns points (n, 3) and (n,) the index of the segment.
     """
     counts = np.maximum(np.ceil(np.linalg.norm(ends - starts, axis=1) / spacing).astype(np.int64), 1) + 1
-    owners = np.repeat(np.arange(len(starts)), counts)
-    within = np.arange(len(owners)) - np.repeat(np.cumsum(counts) - counts, counts)
+    owners, within = ragged(counts)
     fractions = (within / (counts[owners] - 1))[:, None]
     return (1.0 - fractions) * starts[owners] + fractions * ends[owners], owners
 
