@@ -1,13 +1,64 @@
-"""What rooms share: ragged ranges, components of graphs, the robust weight; against plain Python."""
+"""What rooms share: columns, ragged ranges, components of graphs, the robust weight; against plain Python."""
+
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 import taichi as ti
 
+from taichi_edges.arrays.columns import Columns
 from taichi_edges.arrays.components import components
 from taichi_edges.arrays.ranges import ragged
 from taichi_edges.arrays.robust import geman_mcclure, widening
 from taichi_edges.evidence import edgel_matching
+
+# ------------------------------------------------------------------------------------------------------------ columns
+
+
+@dataclass(frozen=True)
+class Names(Columns):
+    letters: np.ndarray
+
+
+@dataclass(frozen=True)
+class Things(Columns):
+    """All that a field may be."""
+
+    places: np.ndarray
+    names: Names
+    noise: float
+    slopes: np.ndarray | None = None
+
+
+THINGS = Things(np.arange(12.0).reshape(4, 3), Names(np.array(list("abcd"))), 0.5)
+
+
+def told(things):
+    """The things as lists."""
+    slopes = things.slopes if things.slopes is None else things.slopes.tolist()
+    return len(things), things.places[:, 0].tolist(), "".join(things.names.letters), things.noise, slopes
+
+
+@pytest.mark.parametrize("chosen", [np.array([False, True, False, True]), np.array([1, 3]), slice(1, 4, 2)])
+def test_chosen_rows_of_all_columns_are_kept_and_what_is_about_all_stays(chosen):
+    assert told(THINGS.keep(chosen)) == (2, [3.0, 9.0], "bd", 0.5, None)
+
+
+def test_rows_are_joined_in_order():
+    some, others = THINGS.keep([2]), THINGS.keep([0, 1])
+    assert told(Things.joined([some, others])) == (3, [6.0, 0.0, 3.0], "cab", 0.5, None)
+    assert told(Things.joined([THINGS])) == told(THINGS)
+
+
+def test_columns_that_are_there_are_joined_and_others_stay_away():
+    full = Things(THINGS.places, THINGS.names, 0.5, np.arange(4))
+    assert told(Things.joined([full, full.keep([3])]))[-1] == [0, 1, 2, 3, 3]
+
+
+def test_what_is_about_all_rows_must_be_the_same_to_join_them():
+    with pytest.raises(AssertionError):
+        Things.joined([THINGS, Things(THINGS.places, THINGS.names, 0.6)])
+
 
 # ------------------------------------------------------------------------------------------------- ranges, components
 

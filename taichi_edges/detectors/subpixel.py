@@ -23,6 +23,7 @@ from itertools import islice
 import cv2
 import numpy as np
 
+from taichi_edges.arrays.columns import Columns
 from taichi_edges.arrays.components import components
 from taichi_edges.detectors.ridges import gaussian_derivatives
 from taichi_edges.views.edgels import Edgels
@@ -79,7 +80,7 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Maxima:
+class Maxima(Columns):
     """Maxima of the gradient across the edge.
 
     rows, columns: (n,) their pixels. points: (n, 2) pixels (u, v). normals: (n, 2) unit, towards more light.
@@ -91,13 +92,6 @@ class Maxima:
     points: np.ndarray
     normals: np.ndarray
     ratios: np.ndarray
-
-    def __len__(self):
-        return len(self.rows)
-
-    def take(self, chosen):
-        """Some of them, by index or mask."""
-        return Maxima(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
 
 def trace_pictures(paths, threads=None, report=None, exponent=None):
@@ -144,7 +138,7 @@ def detect_edgels(image):
     for field in _fields(picture):
         edges, runs = _chained(_maxima(field, _clutter(field)), shape, field.blur)
         free = ~_beside_taken(taken, edges, 1.5 * field.sigma)
-        layers.append(edges.take(_long_runs(free, runs)))
+        layers.append(edges.keep(_long_runs(free, runs)))
         taken[layers[-1].rows, layers[-1].columns] = True
     return _arrays(layers)
 
@@ -241,7 +235,7 @@ def _maxima(field, clutter):
     points = np.stack([columns, rows], axis=1).astype(np.float32) + offsets[:, None] * normals
     standing_out = size - _beside(field, rows, columns, normals)
     ratios = standing_out * (field.levels / clutter)[rows, columns]
-    return Maxima(rows, columns, points, normals, ratios).take(ratios > LOW)
+    return Maxima(rows, columns, points, normals, ratios).keep(ratios > LOW)
 
 
 def _candidates(field, squares, clutter):
@@ -305,7 +299,7 @@ def _chained(maxima, shape, blur):
     if len(maxima) == 0:
         return maxima, np.zeros(0, np.int64)
     order, low, high = _ordered(*_links(maxima, shape))
-    maxima = maxima.take(order)
+    maxima = maxima.keep(order)
 
     def mean(values):
         sums = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
@@ -321,7 +315,7 @@ def _chained(maxima, shape, blur):
     shifts = 0.5 * blur**2 * _curvatures(maxima, low, high - 1)
     points = maxima.points + shifts[:, None] * maxima.normals
     smoothed = Maxima(maxima.rows, maxima.columns, points, maxima.normals, mean(maxima.ratios))
-    return smoothed.take(kept), runs[kept]
+    return smoothed.keep(kept), runs[kept]
 
 
 def _curvatures(maxima, first, last):

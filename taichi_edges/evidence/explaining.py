@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taichi_edges.arrays.columns import Columns
+
 ROUNDS = 4  # owners whose own support turns out weak lose their edgels in the next round
 MATCH_PX = 1.0  # a point explains an edgel within this distance
 NEAR_PX = 3.0  # an edgel within this distance, and nobody else's, should lie on the point if that is on an edge
@@ -21,7 +23,7 @@ VIEWS_AT_ONCE = 16
 
 
 @dataclass(frozen=True)
-class Explained:
+class Explained(Columns):
     """What edgels say about points when each of them counts for one edge alone.
 
     support: (n,) share of the views that have a point in the image in which it lies on an edgel of its own edge.
@@ -40,10 +42,6 @@ class Explained:
     def tight_px(self):
         """Residual up to which an edgel lies on an edge."""
         return max(TIGHT_PX, TIGHT_NOISES * self.noise_px)
-
-    def keep(self, chosen):
-        """What is said about the chosen points only. chosen: (n,) bool or indices."""
-        return Explained(self.support[chosen], self.steadiness[chosen], self.spread[chosen], self.noise_px)
 
 
 def explain(matching, refined):

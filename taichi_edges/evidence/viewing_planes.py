@@ -5,9 +5,11 @@ is the edge: its direction is what all planes have in common, its place their ro
 image loss converges to, but the loss sees grey levels of drawn lines, and these planes the sub-pixel points themselves.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
+
+from taichi_edges.arrays.columns import Columns
 
 RADII_PX = (3.0, 2.0, 1.5, 1.2, 1.0, 1.0)  # of the edgels that are looked at, round by round
 LEAST_SPREAD = 0.02  # planes that lean against each other less (squared sine) say nothing across their common side
@@ -15,7 +17,7 @@ LINE_SPREAD = 0.25  # the planes' third eigenvalue over the second, below which 
 
 
 @dataclass(frozen=True)
-class RefinedPoints:
+class RefinedPoints(Columns):
     """Oriented points and what supports them.
 
     points, directions: (n, 3) unit cube, unit vectors. views: (n,) number of views in which an edgel lies on the point,
@@ -29,18 +31,6 @@ class RefinedPoints:
     views: np.ndarray
     support: np.ndarray
     spread: np.ndarray
-
-    def __len__(self):
-        return len(self.points)
-
-    def keep(self, chosen):
-        """Only the chosen ones. chosen: (n,) bool or indices."""
-        return RefinedPoints(*(getattr(self, field.name)[chosen] for field in fields(self)))
-
-    def joined(self, other):
-        """These points and then the others."""
-        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
-        return RefinedPoints(*(np.concatenate(pair) for pair in pairs))
 
 
 def refine_points(matching, points, directions, radii=RADII_PX):

@@ -1,10 +1,11 @@
 """Where straight 2D runs of edgels meet edges whose place is known: anchors, which give the runs their depth."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from taichi_edges.arrays.columns import Columns
 from taichi_edges.arrays.ranges import ragged
 from taichi_edges.kernels.device import download
 from taichi_edges.views.cameras import NEAR
@@ -39,7 +40,7 @@ class Cameras:
 
 
 @dataclass(frozen=True)
-class Anchors:
+class Anchors(Columns):
     """Where runs meet known shapes in the image, sorted by the run.
 
     runs, shapes: (n,) indices. points: (n, 3) on the shape, in the run's viewing plane. ways: (n,) px along the run.
@@ -52,22 +53,13 @@ class Anchors:
     ways: np.ndarray
     sizes: np.ndarray
 
-    def __len__(self):
-        return len(self.runs)
-
-    def keep(self, chosen):
-        """Only the chosen ones. chosen: (n,) bool or indices."""
-        return Anchors(*(getattr(self, field.name)[chosen] for field in fields(self)))
-
     def sorted(self):
         """The same in order of their runs, and along these."""
         return self.keep(np.lexsort((self.ways, self.runs)))
 
-    def joined(self, other, count):
-        """These and those on further shapes, where there are `count` shapes so far."""
-        other = replace(other, shapes=other.shapes + count)
-        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
-        return Anchors(*map(np.concatenate, pairs)).sorted()
+    def with_further(self, others, count):
+        """These and the other Anchors, those on further shapes, where there are `count` shapes so far."""
+        return Anchors.joined([self, replace(others, shapes=others.shapes + count)]).sorted()
 
 
 def anchors_of(runs, shapes, cameras, pixel):

@@ -1,10 +1,11 @@
 """Which samples of a part's edges a camera sees: hidden-line removal by ray casting, and occluding contours."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from taichi_edges.arrays.columns import Columns
 from taichi_edges.arrays.ranges import ragged
 from taichi_edges.geometry.bezier import evaluate_bezier
 
@@ -16,7 +17,7 @@ FLAT = 1e-9  # 1 - cosine: two triangles nearer than this lie in one plane, wher
 
 
 @dataclass(frozen=True)
-class Samples:
+class Samples(Columns):
     """Points along everything a camera may see as a line.
 
     points: (n, 3). outward: (n, 3) unit directions away from the solid. chains: (n,) int; consecutive points of one
@@ -28,14 +29,11 @@ class Samples:
     chains: np.ndarray
     strokes: np.ndarray
 
-    def joined(self, other):
+    def with_further(self, others):
         """These samples and the others, whose chains and strokes are renumbered."""
-        return Samples(
-            np.concatenate([self.points, other.points]),
-            np.concatenate([self.outward, other.outward]),
-            np.concatenate([self.chains, other.chains + self.chains.max(initial=-1) + 1]),
-            np.concatenate([self.strokes, other.strokes + self.strokes.max(initial=-1) + 1]),
-        )
+        chains = others.chains + self.chains.max(initial=-1) + 1
+        strokes = others.strokes + self.strokes.max(initial=-1) + 1
+        return Samples.joined([self, replace(others, chains=chains, strokes=strokes)])
 
 
 def ray_scene(part):
