@@ -42,29 +42,23 @@ def refine_points(matching, points, directions, radii=RADII_PX):
     points, directions = np.array(points, np.float64), np.array(directions, np.float64)
     for radius in radii:
         equations = matching.equations(points, directions, radius, matching.scale_px)
-        steps, directions = _solve(equations.astype(np.float64), directions)
+        steps, directions = _solve(equations, directions)
         lengths = np.linalg.norm(steps, axis=1, keepdims=True)
         points += steps * np.minimum(1.0, radius * matching.pixel / np.maximum(lengths, 1e-300))
-    equations = matching.equations(points, directions, radii[-1], matching.scale_px).astype(np.float64)
-    weight, seen = equations[:, 9], np.maximum(equations[:, 10], 1.0)
-    values, _ = _principal_axes(equations)
-    spread = np.maximum(values[:, 1], 0.0) / np.maximum(values[:, 2], 1e-12)
-    return RefinedPoints(points, directions, weight, weight / seen, spread)
-
-
-def _principal_axes(equations):
-    """Eigenvalues (n, 3), ascending, and axes (n, 3, 3) of the viewing planes' normals."""
-    rows, columns = np.triu_indices(3)
-    matrices = np.empty((len(equations), 3, 3))
-    matrices[:, rows, columns] = matrices[:, columns, rows] = equations[:, :6]
-    return np.linalg.eigh(matrices)
+    equations = matching.equations(points, directions, radii[-1], matching.scale_px)
+    values = np.linalg.eigh(equations.matrices)[0]
+    spread, views = np.maximum(values[:, 1], 0.0) / np.maximum(values[:, 2], 1e-12), equations.weights
+    return RefinedPoints(points, directions, views, views / np.maximum(equations.views, 1.0), spread)
 
 
 def _solve(equations, directions):
-    """Steps (n, 3) across the common direction of the planes, and that direction where there is one."""
-    values, axes = _principal_axes(equations)
+    """Steps (n, 3) across the common direction of the planes, and that direction where there is one.
+
+    equations: PlaneEquations. directions: (n, 3), so far.
+    """
+    values, axes = np.linalg.eigh(equations.matrices)  # of the planes' normals, ascending
     sides = axes[:, :, 1:]  # (n, 3, 2)
-    pulls = np.einsum("nck,nc->nk", sides, equations[:, 6:9])
+    pulls = np.einsum("nck,nc->nk", sides, equations.gradients)
     firm = values[:, 1:] > LEAST_SPREAD * np.maximum(values[:, 2:], 1e-12)
     steps = -np.einsum("nck,nk->nc", sides, np.where(firm, pulls / np.maximum(values[:, 1:], 1e-12), 0.0))
     common = firm[:, 0] & (values[:, 0] < LINE_SPREAD * values[:, 1])

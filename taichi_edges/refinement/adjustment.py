@@ -164,9 +164,9 @@ def image_equations(problem, wireframe, matching, radius):
     noise = max(support.noise_px, LEAST_NOISE_PX)
     widest = matching.scale_px
     scale = widest if radius > TIGHT_RADIUS_PX else min(widest, SCALE_NOISES * noise)
-    said = matching.equations_of(samples.points, support.edgels, scale).astype(np.float64)
     counted = _counted(wireframe, samples, pixel) * support.certainty  # what agrees by chance says nothing
-    said *= (counted * SPACING_PX / CORRELATED_PX / noise**2)[:, None]
+    said = matching.equations_of(samples.points, support.edgels, scale)
+    said = said.weighed(counted * SPACING_PX / CORRELATED_PX / noise**2)
     planes, pulls = _across(said, samples.directions)
     equations = Equations(problem.layout.size)
     for number, unknowns in enumerate(problem.layout.columns):
@@ -196,12 +196,9 @@ def _counted(wireframe, samples, pixel):
 
 
 def _across(said, directions):
-    """(n, 3, 3) matrices and (n, 3) gradients of the edgels' equations; what they say along the edge is left out."""
-    rows, columns = np.triu_indices(3)
-    matrices = np.empty((len(said), 3, 3))
-    matrices[:, rows, columns] = matrices[:, columns, rows] = said[:, :6]
+    """(n, 3, 3) matrices and (n, 3) gradients of PlaneEquations; what they say along the edge is left out."""
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    return across @ matrices @ across, (across @ said[:, 6:9, None])[:, :, 0]
+    return across @ said.matrices @ across, (across @ said.gradients[:, :, None])[:, :, 0]
 
 
 def _add_places(equations, unknowns, slopes, matrices, gradients):
