@@ -24,7 +24,7 @@ from taichi_edges.geometry.shapes import EllipticArc, Line
 from taichi_edges.kernels.device import start_taichi
 from taichi_edges.refinement.stage import refine_wireframe
 from taichi_edges.scene.settings import ClusterConfig, FitConfig, RefineConfig
-from taichi_edges.strokes.assembly import assemble, fit_assembly
+from taichi_edges.strokes.assembly import assemble, fit_clusters
 from taichi_edges.views.edgels import Edgels
 from taichi_edges.views.views import Views
 
@@ -117,9 +117,8 @@ def measure(copies, options, given):
         found[step] = time.perf_counter() - clock, time.process_time() - processor, peak_memory_mib(), size
         return result
 
-    found_edges = timed("cluster", len(points), lambda: assemble(points, directions, ClusterConfig()))
-    parts = found_edges.labels, found_edges.shared, found_edges.arcs
-    loose, _ = timed("fit", len(found_edges.arcs), lambda: fit_assembly(points, *parts, FitConfig()))
+    clusters = timed("cluster", len(points), lambda: assemble(points, directions, ClusterConfig()))
+    loose, _ = timed("fit", len(clusters.arcs), lambda: fit_clusters(clusters, FitConfig()))
     if not given:
         views = street_views(shapes, copies * length, generator)
         timed("refine", len(loose), lambda: refine_wireframe(loose, views, RefineConfig(enabled=True)))

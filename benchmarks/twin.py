@@ -26,7 +26,7 @@ def load_twin():
 
 def time_twin(twin, splatter, gaussians, camera):
     """Milliseconds (loss, gradient) of the twin for all Gaussians over the selected pixels, scaled up from FEW."""
-    few = _double(gaussians[:FEW])
+    few = _double(gaussians.keep(slice(FEW)))
     pixels, weights, targets = twin.selected(splatter)
     scale = len(gaussians) / len(few)
 

@@ -14,8 +14,6 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 
-import numpy as np
-
 if not __package__:  # run as a script: the project's root takes the place of this folder
     sys.path[0] = str(Path(__file__).resolve().parent.parent)
 
@@ -34,8 +32,9 @@ from taichi_edges.refinement.continuation import continued
 from taichi_edges.refinement.junctions import connected
 from taichi_edges.refinement.stage import refine_wireframe, whole_edges, yardstick_of
 from taichi_edges.scene.scene_file import load_scene
-from taichi_edges.strokes.assembly import ARC_NUMBERS, assemble, fit_assembly
+from taichi_edges.strokes.assembly import assemble, fit_clusters
 from taichi_edges.strokes.clustering import grow_clusters
+from taichi_edges.strokes.clusters import Clusters, read_clusters
 from taichi_edges.synthetic.hard_parts import HARD_PARTS
 from taichi_edges.views.views import read_views
 
@@ -62,8 +61,8 @@ WORST = {"exact p95 mm": ("exact_p95_mm", "{:.2f}")}
 def trained_points(run):
     """Points (n, 3) and directions (n, 3): the trained centres that pass the paper's filters, in the unit cube."""
     cluster.cluster(with_filter(run, refine=False))
-    with np.load(run.path("clusters.npz")) as archive:
-        return archive["points"], archive["directions"]
+    clusters = read_clusters(run.path("clusters.npz"))
+    return clusters.points, clusters.directions
 
 
 def with_filter(run, **settings):
@@ -75,9 +74,8 @@ def with_filter(run, **settings):
 def traversed(run):
     """The paper's clusters, those of graph traversal, and a line or curve through each of them."""
     points, directions = trained_points(run)
-    labels = grow_clusters(points, directions, run.config.cluster)
-    unknown = np.full((labels.max(initial=-1) + 1, ARC_NUMBERS), np.nan)
-    return fit_assembly(points, labels, np.zeros((0, 2), int), unknown, run.config.fit)[0]
+    clusters = Clusters.of(points, directions, grow_clusters(points, directions, run.config.cluster))
+    return fit_clusters(clusters, run.config.fit)[0]
 
 
 def claimed(run):
@@ -94,8 +92,7 @@ def on_viewing_planes(run):
 
 def fitted(run, points, directions):
     """The edges of oriented points."""
-    found = assemble(points, directions, run.config.cluster)
-    return fit_assembly(points, found.labels, found.shared, found.arcs, run.config.fit)[0]
+    return fit_clusters(assemble(points, directions, run.config.cluster), run.config.fit)[0]
 
 
 def filtered(run, **settings):

@@ -17,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from taichi_edges.exporters.overlays import background, draw_edges
 from taichi_edges.exporters.palette import label_colours
 from taichi_edges.geometry.wireframe import read_wireframe
+from taichi_edges.strokes.clusters import read_clusters
 from taichi_edges.views.views import read_views
 
 PANEL, WIDE_PANEL = 420, 760  # px
@@ -65,11 +66,10 @@ def main(folder, view_name, out):
     view = views.names.index(view_name)
     wireframe, _ = read_wireframe(folder / "edges.json")
     wireframe = wireframe.transformed(views.similarity.to_unit, views.similarity.scale)
-    with np.load(folder / "clusters.npz") as clusters:
-        points, labels = clusters["points"], clusters["labels"]
+    clusters = read_clusters(folder / "clusters.npz")
     shape = (views.height, views.width)
     edge_map = cv2.cvtColor(255 - views.edge_maps[view], cv2.COLOR_GRAY2BGR)
-    dots = draw_points(shape, views.project(points, view)[0], label_colours(labels))
+    dots = draw_points(shape, views.project(clusters.points, view)[0], label_colours(clusters.labels))
     own_picture = folder / "images" / f"{view_name}.png"
     if own_picture.exists():
         canvas = background(replace(views, image_paths=(str(own_picture),) * len(views)), view)

@@ -58,7 +58,7 @@ def part(tmp_path_factory):
     samples, paths = [], []
     for view, camera in enumerate(zip(intrinsics, poses)):
         lens, pose = camera
-        drawn = edges.joined(sample_contours(solid, camera_centre(pose), SAMPLE_PX * pixel))
+        drawn = edges.with_further(sample_contours(solid, camera_centre(pose), SAMPLE_PX * pixel))
         pixels, _ = project(drawn.points, *camera)
         visible = visible_from(scene, drawn, camera_centre(pose))
         alpha = coverage(scene, *camera)

@@ -9,8 +9,9 @@ from edgel_scenes import CylinderContour, arc, centre, line, pixel_of, tangents,
 from taichi_edges.evidence.edgel_matching import EdgelMatching
 from taichi_edges.evidence.explaining import explain
 from taichi_edges.evidence.viewing_planes import refine_points
+from taichi_edges.fitting.arcs import Arc
 from taichi_edges.scene.settings import FilterConfig
-from taichi_edges.strokes.assembly import ARC_NUMBERS, Assembly
+from taichi_edges.strokes.clusters import Clusters
 from taichi_edges.strokes.contours import CONTOUR_SHARE, likelihood_ratio, steady_edges, without_contours
 
 A = line([0.2, 0.3, 0.3], [0.8, 0.35, 0.4])
@@ -33,7 +34,7 @@ def judged(views, curves, radii=(1.0,), moved=True):
     found = refine_points(matching, places, along, radii)
     found = found if moved else replace(found, points=places, directions=along)
     labels = np.repeat(np.arange(len(curves)), len(s))
-    return steady_edges(matching, found.points, found.directions, labels, explain(matching, found), LEAST)
+    return steady_edges(matching, Clusters.of(found.points, found.directions, labels), explain(matching, found), LEAST)
 
 
 def lines_on(contour, views, every):
@@ -93,7 +94,7 @@ def test_evidence_grows_with_the_share_and_with_the_views():
     assert likelihood_ratio(2, 2, usual) == pytest.approx(-2 * np.log(usual), rel=1e-3)
 
 
-def test_the_assembly_is_left_without_contours(generator):
+def test_clusters_are_left_without_contours(generator):
     contour = CylinderContour([0.6, 0.5], 12 * PIXEL, 0.2, 0.8)
     views = views_of([A, contour], generator, noise_px=NOISE_PX)
     limb, s = lines_on(contour, views, every=24)[0], np.linspace(0.1, 0.9, 40)
@@ -101,16 +102,15 @@ def test_the_assembly_is_left_without_contours(generator):
     found = refine_points(
         matching, np.concatenate([limb(s), A(s)]), np.concatenate([tangents(limb, s), tangents(A, s)]), (3.0, 1.0)
     )
-    assembly = Assembly(
-        np.repeat([0, 1], 40), np.array([[0, 1], [79, 0]]), np.arange(2.0)[:, None] * np.ones(ARC_NUMBERS)
-    )
-    explained = explain(matching, found)
-    kept, contours = without_contours(assembly, found.points, found.directions, explained, views, FilterConfig())
-    assert contours == 1 and kept.arcs[:, 0].tolist() == [1.0]
+    arcs = tuple(Arc(np.full(3, float(number)), np.ones(3), np.ones(3)) for number in range(2))
+    labels, shared = np.repeat([0, 1], 40), np.array([[0, 1], [79, 0]])
+    clusters = Clusters(found.points, found.directions, labels, shared, arcs)
+    kept, contours = without_contours(clusters, explain(matching, found), views, FilterConfig())
+    assert contours == 1 and kept.arcs == arcs[1:]
     np.testing.assert_array_equal(kept.labels, np.repeat([-1, 0], 40))
     np.testing.assert_array_equal(kept.shared, [[0, 0]])
-    untouched, contours = without_contours(assembly, found.points, found.directions, None, views, FilterConfig())
-    assert untouched is assembly and contours == 0
+    untouched, contours = without_contours(clusters, None, views, FilterConfig())
+    assert untouched is clusters and contours == 0
 
 
 def test_the_result_does_not_depend_on_threads(start_taichi, generator):

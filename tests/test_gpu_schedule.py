@@ -64,7 +64,7 @@ def far_from_cuts(gaussians, scene, slack=1e-3):
         splats = project(gaussians, *scene.camera(view))
         strict, lax = alphas(splats, pixels, -slack), alphas(splats, pixels, slack)
         far &= ((strict > 0) == (lax > 0)).all(axis=1) & (lax < 0.999 - slack).all(axis=1)
-    return gaussians[far]
+    return gaussians.keep(far)
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +138,7 @@ def measure(open_splatter, inputs, arch, real, schedule):
     found.both = record(splatter, inputs, OUTSIDE, (0.3, 0.7))
     found.two_views = two_views(splatter, inputs)
     found.adam = adam(splatter, inputs)
-    splatter.load(inputs.gaussians[:0])
+    splatter.load(inputs.gaussians.keep(slice(0)))
     splatter.select_pixels(OUTSIDE, 4)
     splatter.record()
     found.empty = splatter.loss[None], transmittance(splatter)

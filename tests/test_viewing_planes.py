@@ -141,7 +141,9 @@ def test_a_gpu_matches_as_the_cpu_does(start_taichi, generator, arch):
     for device in ("cpu", arch):
         start_taichi("f32", 1, device)
         matching = EdgelMatching(views)
-        found[device] = matching.equations(points, along, 2.0, 0.5), *matching.matches(points, along, slice(0, 6), 2.0)
+        equations = matching.equations(points, along, 2.0, 0.5)
+        numbers = (equations.matrices.reshape(-1, 9), equations.gradients, equations.weights, equations.views)
+        found[device] = np.column_stack(numbers), *matching.matches(points, along, slice(0, 6), 2.0)
     same = found["cpu"][1] == found[arch][1]
     assert same.mean() > 0.99  # where two edgels are equally near, rounding decides
     np.testing.assert_array_equal(found["cpu"][3], found[arch][3])

@@ -8,7 +8,7 @@ from taichi_edges.fitting.arcs import Arc, fit_arc
 from taichi_edges.geometry.bezier import bezier_lengths, evaluate_bezier
 from taichi_edges.scene.settings import ClusterConfig, FitConfig
 from taichi_edges.strokes.arc_growth import Cloud, Scale
-from taichi_edges.strokes.assembly import assemble, fit_assembly, pack_arc, unpack_arc
+from taichi_edges.strokes.assembly import assemble, fit_clusters
 from taichi_edges.strokes.clustering import seed_order
 from taichi_edges.strokes.free_curves import free_curves
 from taichi_edges.strokes.merging import Piece
@@ -69,9 +69,9 @@ def observed(*parts, noise=2e-4, seed=0):
 
 
 def edges_of(points, directions):
-    """The Assembly and the EdgeSet of oriented points."""
+    """The Clusters and the EdgeSet of oriented points."""
     found = assemble(points, directions, ClusterConfig())
-    return found, fit_assembly(points, found.labels, found.shared, found.arcs, FitConfig())[0].edge_set()
+    return found, fit_clusters(found, FitConfig())[0].edge_set()
 
 
 def count_edges(edges):
@@ -120,11 +120,6 @@ def test_cubics_of_an_arc_follow_it(angle):
     assert not arc.closed or np.array_equal(cubics[0, 0], cubics[-1, 3])
 
 
-def test_an_arc_outlives_being_packed():
-    arc = Arc(np.array([0.3, 0, 0]), np.array([0, 1.0, 0]), np.array([-5.0, 0, 0]), -0.1, 0.2, False)
-    assert np.array_equal(pack_arc(unpack_arc(pack_arc(arc))), pack_arc(arc)) and unpack_arc(pack_arc(None)) is None
-
-
 def test_an_arc_goes_on_where_it_is_moved_to_its_middle():
     arc = Arc(np.array([0.3, 0, 0]), np.array([0, 1.0, 0]), np.array([-5.0, 0, 0]), -0.1, 0.3)
     moved = arc.recentred()
@@ -144,8 +139,7 @@ def test_a_rim_that_lines_touch_is_one_closed_circle(noise, seed):
     ]
     rim = circle(0.2)
     found, edges = edges_of(*observed(rim, *tangents, noise=noise, seed=seed)[:2])
-    arcs = [unpack_arc(numbers) for numbers in found.arcs]
-    closed = [arc for arc in arcs if arc is not None and arc.closed]
+    closed = [arc for arc in found.arcs if arc is not None and arc.closed]
     assert len(closed) == 1 and 1 / closed[0].curvature == pytest.approx(0.2, abs=2 * noise)
     truth = np.concatenate([part[0] for part in (rim, *tangents)])
     to_edges, to_truth = distances_to(edges, truth)
@@ -169,7 +163,7 @@ def test_curves_that_touch_a_rim_in_their_middle_leave_it_whole(seed):
 
         lobes.append(curve(lobe, -np.pi / 6, np.pi / 6))
     found, edges = edges_of(*observed(circle(0.2), *lobes, seed=seed)[:2])
-    closed = [arc for arc in map(unpack_arc, found.arcs) if arc is not None and arc.closed]
+    closed = [arc for arc in found.arcs if arc is not None and arc.closed]
     assert len(closed) == 1 and 1 / closed[0].curvature == pytest.approx(0.2, abs=5e-4)
     to_edges, to_truth = distances_to(edges, np.concatenate([circle(0.2)[0], *(part[0] for part in lobes)]))
     assert np.quantile(to_edges, 0.97) < 0.005 and to_truth.max() < 0.005
@@ -316,7 +310,7 @@ def test_a_free_curve_is_one_edge_and_closes_if_it_is_closed(generator, curve, c
     along = along / np.linalg.norm(along, axis=1, keepdims=True) + generator.normal(0, 0.02, (len(t), 3))
     points = curve(t) + generator.normal(0, 2e-4, (len(t), 3))
     found = assemble(points, along / np.linalg.norm(along, axis=1, keepdims=True), ClusterConfig())
-    edges, counts = fit_assembly(points, found.labels, found.shared, found.arcs, FitConfig())
+    edges, counts = fit_clusters(found, FitConfig())
     assert len(found.arcs) == 1 and counts["loop" if closed else "curve"] == 1
     off = cKDTree(edges.edge_set().sample(5e-4)[0]).query(curve(fine))[0]
     assert off.max() < 3e-3

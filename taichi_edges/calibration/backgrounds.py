@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from taichi_edges.arrays.columns import Columns
 from taichi_edges.calibration.offsets import Observations
 from taichi_edges.detectors.ridges import gaussian_derivatives
 
@@ -30,7 +31,7 @@ ALONE = 0.5  # other gradients across the edgel are lower than this share of the
 
 
 @dataclass(frozen=True)
-class Sides:
+class Sides(Columns):
     """What lies beside n edgels.
 
     outward:    (n, 2) unit vectors across the edge towards the background; just normals where there is none.
@@ -47,11 +48,6 @@ class Sides:
     interior: np.ndarray
     steps: np.ndarray
     from_alpha: np.ndarray
-
-    @staticmethod
-    def joined(sides):
-        """Of all views, one after the other."""
-        return Sides(*(np.concatenate([getattr(side, name) for side in sides]) for name in Sides.__annotations__))
 
     def silhouettes(self, shift=(0.0, 0.0)):
         """(n,) 0..1: how surely each edgel, of maps shifted by so many px, is on a silhouette.

@@ -107,10 +107,9 @@ class Consensus:
             offsets = ((self.edgels.points[found] - self.views.project(points, view)[0]) * normals).sum(axis=1)
             across_edge = np.einsum("ni,nij->nj", normals, self.views.camera(view).slopes(points))
             slopes = self.pixel * np.einsum("nj,nkj->nk", across_edge, self.across[owners])
-            return offsets, normals, flags[found], found, np.full(len(found), view), owners, slopes
+            return Observations(offsets, normals, flags[found], found, np.full(len(found), view), owners, slopes)
 
-        columns = zip(*self._for_each_view(look), strict=True)
-        return Observations(*(np.concatenate(column) for column in columns))
+        return Observations.joined(self._for_each_view(look))
 
     def residuals(self, values):
         """(n,) px from the 3D point that explains an edgel to it, without the biases, outward; NaN where none does.

@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taichi_edges.arrays.columns import Columns
+from taichi_edges.arrays.robust import geman_mcclure
+
 LEAST_OBSERVATIONS = 200  # fewer tell nothing
 # px, median; where references agree with edgels no better, as on textured photographs or between thin bars, chance has
 # made the pairs. The scale of a robust fit grows with what it is given, so its standard errors do not tell.
@@ -22,7 +25,7 @@ VIEW_BLOCKS, SPLITS = 10, 4  # views next to each other, and halves of halves of
 
 
 @dataclass(frozen=True)
-class Observations:
+class Observations(Columns):
     """Edgels against where the edge should be: offset = b * silhouette + normal . shift + slope . displacement.
 
     offsets:    (m,) px, from the reference to the edgel along `normals`.
@@ -40,14 +43,6 @@ class Observations:
     views: np.ndarray
     owners: np.ndarray | None = None
     slopes: np.ndarray | None = None
-
-    def __len__(self):
-        return len(self.offsets)
-
-    def keep(self, chosen):
-        """Only the chosen observations. chosen: (m,) bool."""
-        arrays = (getattr(self, name) for name in Observations.__annotations__)
-        return Observations(*(None if array is None else array[chosen] for array in arrays))
 
     @property
     def columns(self):
@@ -149,7 +144,7 @@ def _weights(residuals, redescending):
     if not redescending:
         return LEAST_RESIDUAL / np.maximum(sizes, LEAST_RESIDUAL)
     scale = CUT * max(NORMAL_MAD * np.median(sizes), LEAST_RESIDUAL)
-    return 1.0 / (1.0 + (residuals / scale) ** 2) ** 2
+    return geman_mcclure((residuals / scale) ** 2)
 
 
 def _residuals(observations, values, displacements):

@@ -5,7 +5,6 @@ from dataclasses import asdict
 import numpy as np
 
 from taichi_edges.errors import UserError
-from taichi_edges.files.artefacts import replacing
 from taichi_edges.views.views import pixel_size, read_views
 
 
@@ -17,6 +16,7 @@ def cluster(run):
     from taichi_edges.points.filtering import FEW_VIEWS, filter_points
     from taichi_edges.splatting.gaussians import Gaussians
     from taichi_edges.strokes.assembly import assemble
+    from taichi_edges.strokes.clusters import write_clusters
     from taichi_edges.strokes.contours import without_contours
 
     if not is_running(run.arch, run.threads):  # after the training it is
@@ -35,12 +35,11 @@ def cluster(run):
             seen = f"an edge must be seen in {run.config.filter.min_views:g} views at full strength"
             cure = f"{len(views)} views are too few, {seen}: take more, or set filter.refine: false"
         raise UserError(f"{run.path('gaussians.ply')}: {problem}; {cure}")
-    found = assemble(points, directions, run.config.cluster, pixel_size(views))
-    found, contours = without_contours(found, points, directions, explained, views, run.config.filter)
-    labels = found.labels
+    clusters = assemble(points, directions, run.config.cluster, pixel_size(views))
+    clusters, contours = without_contours(clusters, explained, views, run.config.filter)
+    labels = clusters.labels
     write_oriented_points(run.path("points.ply"), views.similarity.to_input(points), directions, labels)
-    with replacing(run.path("clusters.npz")) as unfinished, open(unfinished, "wb") as file:
-        np.savez_compressed(file, points=points, directions=directions, **asdict(found))
+    write_clusters(run.path("clusters.npz"), clusters)
     found = {"points": len(points), "clusters": int(labels.max() + 1), "unclustered": int((labels < 0).sum())}
     return {**asdict(counts), **found, "contours": contours}
 

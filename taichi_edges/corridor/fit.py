@@ -1,19 +1,16 @@
 """The stage `fit`: a shape for each cluster of points."""
 
-import numpy as np
-
 from taichi_edges.geometry.wireframe import write_wireframe
 from taichi_edges.views.views import read_views
 
 
 def fit(run):
     """`clusters.npz` -> `edges_fit.json` (input frame): edges that do not meet yet."""
-    from taichi_edges.strokes.assembly import fit_assembly
+    from taichi_edges.strokes.assembly import fit_clusters
+    from taichi_edges.strokes.clusters import read_clusters
 
     views = read_views(run.path("views.npz"))
-    with np.load(run.path("clusters.npz")) as archive:
-        parts = (archive[name] for name in ("points", "labels", "shared", "arcs"))
-        edges, counts = fit_assembly(*parts, run.config.fit)
+    edges, counts = fit_clusters(read_clusters(run.path("clusters.npz")), run.config.fit)
     clusters = {kind: counts[kind] for kind in ("line", "curve", "loop", "short", "degenerate")}
     about = {"frame": "input", "clusters": clusters, "scene": run.config.name, "seed": run.config.seed}
     write_wireframe(

@@ -3,10 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from taichi_edges.arrays.components import components
 from taichi_edges.views.edgels import Edgels
 
 LINK_PX = 1.6  # between edgels next to each other on a chain; they are about 1 px apart
@@ -49,12 +48,6 @@ def links_between(
     cosines = np.abs((normals[first] * normals[second]).sum(axis=1))
     way = points[second] - points[first]
     return first, second, cosines, np.abs([(way * normals[end]).sum(axis=1) for end in (first, second)])
-
-
-def components(count: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """(count,) labels, 0 .. n - 1, of the connected components of a graph with edges from `first` to `second`."""
-    graph = coo_matrix((np.ones(len(first), bool), (first, second)), shape=(count, count))
-    return connected_components(graph, directed=False)[1]
 
 
 def chain_lengths(edgels: Edgels) -> np.ndarray:

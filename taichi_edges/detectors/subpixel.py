@@ -24,9 +24,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from taichi_edges.arrays.columns import Columns
+from taichi_edges.arrays.components import components
 from taichi_edges.detectors.ridges import gaussian_derivatives
 from taichi_edges.views.edgels import Edgels
 from taichi_edges.views.pictures import Picture, as_picture, levels_per_light, read_picture
@@ -82,7 +82,7 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Maxima:
+class Maxima(Columns):
     """Maxima of the gradient across the edge.
 
     rows, columns: (n,) their pixels. points: (n, 2) pixels (u, v). normals: (n, 2) unit, towards more light.
@@ -94,13 +94,6 @@ class Maxima:
     points: np.ndarray
     normals: np.ndarray
     ratios: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def take(self, chosen: np.ndarray) -> "Maxima":
-        """Some of them, by index or mask."""
-        return Maxima(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
 
 def trace_pictures(
@@ -152,7 +145,7 @@ def detect_edgels(image: Picture | np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     for field in _fields(picture):
         edges, runs = _chained(_maxima(field, _clutter(field)), shape, field.blur)
         free = ~_beside_taken(taken, edges, 1.5 * field.sigma)
-        layers.append(edges.take(_long_runs(free, runs)))
+        layers.append(edges.keep(_long_runs(free, runs)))
         taken[layers[-1].rows, layers[-1].columns] = True
     return _arrays(layers)
 
@@ -251,7 +244,7 @@ def _maxima(field: Field, clutter: np.ndarray) -> Maxima:
     points = np.stack([columns, rows], axis=1).astype(np.float32) + offsets[:, None] * normals
     standing_out = size - _beside(field, rows, columns, normals)
     ratios = standing_out * (field.levels / clutter)[rows, columns]
-    return Maxima(rows, columns, points, normals, ratios).take(ratios > LOW)
+    return Maxima(rows, columns, points, normals, ratios).keep(ratios > LOW)
 
 
 def _candidates(field: Field, squares: np.ndarray, clutter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -315,7 +308,7 @@ def _chained(maxima: Maxima, shape: tuple[int, ...], blur: float) -> tuple[Maxim
     if len(maxima) == 0:
         return maxima, np.zeros(0, np.int64)
     order, low, high = _ordered(*_links(maxima, shape))
-    maxima = maxima.take(order)
+    maxima = maxima.keep(order)
 
     def mean(values: np.ndarray) -> np.ndarray:
         sums = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
@@ -331,7 +324,7 @@ def _chained(maxima: Maxima, shape: tuple[int, ...], blur: float) -> tuple[Maxim
     shifts = 0.5 * blur**2 * _curvatures(maxima, low, high - 1)
     points = maxima.points + shifts[:, None] * maxima.normals
     smoothed = Maxima(maxima.rows, maxima.columns, points, maxima.normals, mean(maxima.ratios))
-    return smoothed.take(kept), runs[kept]
+    return smoothed.keep(kept), runs[kept]
 
 
 def _curvatures(maxima: Maxima, first: np.ndarray, last: np.ndarray) -> np.ndarray:
@@ -395,12 +388,10 @@ def _ordered(ahead: np.ndarray, behind: np.ndarray) -> tuple[np.ndarray, np.ndar
     """(n,) the maxima chain by chain, in order; and, in that order, (n,) the window of each, low .. high - 1."""
     count = len(ahead)
     linked = np.flatnonzero(ahead >= 0)
-    graph = coo_array((np.ones(len(linked), bool), (linked, ahead[linked])), shape=(count, count))
-    chains, labels = connected_components(graph, directed=False)
-    open_chain = np.zeros(chains, bool)
+    labels = components(count, linked, ahead[linked])
+    first = np.unique(labels, return_index=True)[1]
+    open_chain = np.zeros(len(first), bool)
     open_chain[labels[behind < 0]] = True
-    first = np.full(chains, count)
-    np.minimum.at(first, labels, np.arange(count))
     behind = behind.copy()
     behind[first[~open_chain]] = -1  # a closed chain is cut at its first pixel
     ranks = (behind >= 0).astype(np.int64)
@@ -408,7 +399,7 @@ def _ordered(ahead: np.ndarray, behind: np.ndarray) -> tuple[np.ndarray, np.ndar
         ranks += np.where(behind >= 0, ranks[behind], 0)
         behind = np.where(behind >= 0, behind[behind], -1)
     order = np.lexsort((ranks, labels))
-    ends = np.cumsum(np.bincount(labels, minlength=chains))
+    ends = np.cumsum(np.bincount(labels))
     starts = np.concatenate([[0], ends])[:-1]
     here, label = np.arange(count), labels[order]
     return order, np.maximum(here - WINDOW, starts[label]), np.minimum(here + WINDOW + 1, ends[label])

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from taichi_edges.arrays.ranges import ragged
+
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
@@ -95,8 +97,7 @@ def subdivided(polyline: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if not len(lengths):
         return polyline[:1], np.zeros((1, 3))
     counts = np.ceil(lengths / STEP).astype(np.int64)
-    chord = np.repeat(np.arange(len(lengths)), counts)
-    number = np.arange(len(chord)) - np.repeat(np.cumsum(counts) - counts, counts)
+    chord, number = ragged(counts)
     vertices = starts[chord] + (number / counts[chord])[:, None] * chords[chord]
     directions = (chords / lengths[:, None])[chord]
     return np.concatenate([vertices, polyline[-1:]]), np.concatenate([directions, directions[-1:]])

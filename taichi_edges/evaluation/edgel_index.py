@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+
+from taichi_edges.arrays.components import components
 
 MOST_SINE = 0.35  # of the angle between a direction and an edgel's: 20 degrees, as a bend or noise may turn it
 LINK_PX = 2.0  # edgels that follow each other are about a pixel apart; one may be missing
@@ -80,17 +80,17 @@ class EdgelIndex:
         beside = [np.abs((self.normals[side] * away).sum(axis=1)) <= LINK_BESIDE_PX for side in (one, other)]
         parallel = np.abs((self.normals[one] * along[other]).sum(axis=1)) <= MOST_SINE
         linked = beside[0] & beside[1] & parallel
-        graph = coo_matrix((linked[linked], (one[linked], other[linked])), shape=(len(along), len(along)))
-        count, chains = connected_components(graph, directed=False)
-        lengths, extents = self._chain_sizes(count, chains)
+        chains = components(len(along), one[linked], other[linked])
+        lengths, extents = self._chain_sizes(chains)
         return ((extents >= LONG_PX) & (lengths <= MOST_WINDING * extents))[chains]
 
-    def _chain_sizes(self, count: int, chains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _chain_sizes(self, chains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(c,) pixels that each chain covers, and (c,) px of the diagonal of its bounding box. chains: (e,) int."""
         columns, rows = np.clip(np.rint(self.points.T).astype(np.int64), 0, np.array(self.size)[:, None] - 1)
         pixels = self.size[0] * self.size[1]
         covered = np.unique(chains.astype(np.int64) * pixels + rows * self.size[0] + columns) // pixels
-        low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+        lengths = np.bincount(covered)
+        low, high = np.full((len(lengths), 2), np.inf), np.full((len(lengths), 2), -np.inf)
         np.minimum.at(low, chains, self.points)
         np.maximum.at(high, chains, self.points)
-        return np.bincount(covered, minlength=count), np.linalg.norm(high - low, axis=1)
+        return lengths, np.linalg.norm(high - low, axis=1)

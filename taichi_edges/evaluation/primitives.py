@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from taichi_edges.arrays.components import components
 from taichi_edges.evaluation.dense_curves import STEP
 
 # Points at most this far apart, in normalised units, are one vertex. Joined edges share it exactly, but an edge that
@@ -117,15 +118,10 @@ def touching_pieces(curves: Sequence[np.ndarray]) -> list[tuple[int, int]]:
 
 def grouped(count: int, pairs: Sequence[Sequence[int]]) -> list[list[int]]:
     """Lists of the numbers 0..count-1 that the pairs connect, in the order of their first ones."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    one, other = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
-    links = coo_array((np.ones(len(one)), (one, other)), shape=(count, count))
-    total, labels = connected_components(links, directed=False) if count else (0, np.zeros(0, np.int64))
+    labels = components(count, *np.array(pairs, dtype=np.int64).reshape(-1, 2).T)
     order = np.argsort(labels, kind="stable")
-    groups = np.split(order, np.cumsum(np.bincount(labels, minlength=total))[:-1]) if count else []
-    return sorted(([int(index) for index in group] for group in groups), key=min)
+    groups = np.split(order, np.cumsum(np.bincount(labels))[:-1]) if count else []
+    return [group.tolist() for group in groups]
 
 
 def chains(pieces: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from taichi_edges.arrays.ranges import ragged
+
 if TYPE_CHECKING:
     from taichi_edges.views.cameras import Camera
 
@@ -44,8 +46,7 @@ class Chords:
         first = np.flatnonzero(np.diff(self.owners, prepend=-1))
         begin, end = self.travelled[first], self.travelled[np.append(first, len(self))[1:]]
         counts = np.maximum(np.rint((end - begin) / spacing), 1).astype(np.int64)
-        polyline = np.repeat(np.arange(len(first)), counts)
-        number = np.arange(len(polyline)) - (np.cumsum(counts) - counts)[polyline]
+        polyline, number = ragged(counts)
         step = ((end - begin) / counts)[polyline]
         middles, ends = begin[polyline] + (number + 0.5) * step, begin[polyline] + (number + 1) * step
         chord = np.clip(np.searchsorted(self.travelled, middles, side="right") - 1, 0, len(self) - 1)
@@ -64,8 +65,8 @@ class Chords:
         vectors = other[:, :2] / other[:, 2:3] - begin
         lengths = np.linalg.norm(vectors, axis=1)
         counts = np.maximum(np.ceil(lengths / spacing), 1).astype(np.int64)
-        chord = np.repeat(np.arange(len(seen)), counts)
-        share = (np.arange(len(chord)) - (np.cumsum(counts) - counts)[chord] + 0.5) / counts[chord]
+        chord, number = ragged(counts)
+        share = (number + 0.5) / counts[chord]
         pixels = begin[chord] + share[:, None] * vectors[chord]
         # Of a line in perspective: what is half-way in the image is nearer than half-way to its nearer end.
         near, far = one[chord, 2], other[chord, 2]

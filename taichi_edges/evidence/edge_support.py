@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import gammainc
 
+from taichi_edges.arrays.robust import geman_mcclure
 from taichi_edges.evidence.edgel_matching import MOST_SINE
 from taichi_edges.evidence.explaining import BEST_SUPPORTED, NOISE_PER_MEDIAN, TIGHT_NOISES, TIGHT_PX
 from taichi_edges.evidence.lying import EdgelsAbout, steadiness
@@ -285,5 +286,6 @@ def chance_weight(matching):
 def _weights(matching, edgels, residuals):
     """(n, V) strength times closeness of matched edgels, 0 where there is none."""
     weights, at = np.zeros(edgels.shape, np.float32), edgels >= 0
-    weights[at] = matching.edgels.strengths[edgels[at]] / (1.0 + (residuals[at] / matching.scale_px) ** 2) ** 2
+    squared = (residuals[at] / matching.scale_px) ** 2
+    weights[at] = geman_mcclure(squared, matching.edgels.strengths[edgels[at]])
     return weights

@@ -9,6 +9,8 @@ import numpy as np
 import taichi as ti
 from scipy.spatial import cKDTree
 
+from taichi_edges.arrays import robust
+from taichi_edges.evidence.plane_equations import GRADIENT, NUMBERS, VIEWS, WEIGHT, PlaneEquations
 from taichi_edges.kernels.device import download, upload
 from taichi_edges.kernels.edgel_grid import CELL, EdgelGrid
 from taichi_edges.kernels.points import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D, blocks_of, load_camera, load_point
@@ -20,7 +22,8 @@ OWNED_PX, OWNED_MOST = 2.0, 6  # neighbours of an edgel: those so near, itself i
 OWNED_BESIDE_PX = 0.5  # and no farther to the side: an edge may run beside another
 APART = 100.0  # px; views are laid out so far apart when one tree holds the edgels of all of them
 LEAST_VIEWS = 2.5  # of full strength; two planes always meet
-EQUATIONS = 11  # numbers of a point's normal equations, see `add_equations`
+
+geman_mcclure = ti.func(robust.geman_mcclure)
 
 
 class EdgelMatching:
@@ -60,19 +63,19 @@ class EdgelMatching:
         return [(some.sum(), np.prod(np.ptp(points, axis=0) + 1.0)) for points, _, some in views if len(points)]
 
     def equations(self, points, directions, radius, scale):
-        """(n, EQUATIONS) float32 normal equations of where the points are, see `add_equations`.
+        """PlaneEquations of the edgels next to points.
 
         points, directions: (n, 3). radius: px, of the edgels looked at. scale: px, of the robust weights.
         """
         if len(points) == 0:
-            return np.zeros((0, EQUATIONS), np.float32)
-        equations = upload(np.zeros((len(points), EQUATIONS), np.float32))
+            return PlaneEquations.of(np.zeros((0, NUMBERS), np.float32))
+        equations = upload(np.zeros((len(points), NUMBERS), np.float32))
         points, directions = (upload(np.asarray(array, np.float32)) for array in (points, directions))
         grid = (self.grid.rows, self.grid.columns, self.grid.starts, self.grid.elements)
         gates = float(radius), MOST_SINE, float(scale)
         edgels = (*self.size, *grid, self.grid.strengths)
         add_equations(*blocks_of(points), points, directions, self.cameras, *edgels, *gates, equations)
-        return download(equations)
+        return PlaneEquations.of(download(equations))
 
     @cached_property
     def planes(self):
@@ -83,13 +86,13 @@ class EdgelMatching:
     def equations_of(self, points, edgels, scale):
         """`equations` of the edgels that each point is said to have: (n, V) int32 index into Edgels, -1 none.
 
-        The last of the EQUATIONS, the number of views that have the point in the image, stays 0.
+        In how many images the points are is not asked.
         """
-        equations = upload(np.zeros((len(points), EQUATIONS), np.float32))
+        equations = upload(np.zeros((len(points), NUMBERS), np.float32))
         points, edgels = upload(np.asarray(points, np.float32)), upload(np.asarray(edgels, np.int32))
         if points.shape[0]:
             add_equations_of(*blocks_of(points), points, self.cameras, edgels, self.planes, float(scale), equations)
-        return download(equations)
+        return PlaneEquations.of(download(equations))
 
     def matches(self, points, directions, views, radius):
         """(n, v) int32: the edgel, an index into Edgels, that each point has in some views (a slice); -1 none.
@@ -161,22 +164,22 @@ def is_inside(pixel, height, width):
 
 @ti.func
 def add_plane(i, row, pixel, slopes, planes: ti.template(), strength, scale, equations: ti.template()):
-    """Adds the viewing plane of an edgel, u, v and normal in `row` of `planes`, to equations[i], see `add_equations`.
+    """Adds the viewing plane of an edgel, u, v and normal in `row` of `planes`, to equations[i], see PlaneEquations.
 
     pixel, slopes: of the point, see `project_line`. strength: of the edgel.
     """
     normal = ti.Vector([planes[row, 2], planes[row, 3]])
     residual = normal.dot(pixel - ti.Vector([planes[row, 0], planes[row, 1]]))
     slope = normal @ slopes
-    weight = strength / (1.0 + (residual / scale) ** 2) ** 2
+    weight = geman_mcclure((residual / scale) ** 2, strength)
     k = 0
     for a in ti.static(range(3)):
         for b in ti.static(range(a, 3)):
             equations[i, k] = equations[i, k] + weight * slope[a] * slope[b]  # += would be atomic
             k += 1
     for a in ti.static(range(3)):
-        equations[i, 6 + a] = equations[i, 6 + a] + weight * residual * slope[a]
-    equations[i, 9] = equations[i, 9] + weight
+        equations[i, GRADIENT + a] = equations[i, GRADIENT + a] + weight * residual * slope[a]
+    equations[i, WEIGHT] = equations[i, WEIGHT] + weight
 
 
 @ti.kernel
@@ -198,12 +201,9 @@ def add_equations(
     scale: ti.f32,
     equations: F32_2D,
 ):
-    """Normal equations of the viewing planes of the edgels matched by each point.
+    """equations (n, NUMBERS): the sums of PlaneEquations over the edgels matched by each point.
 
-    An edgel with normal m asks for m . (projection - edgel) = 0: a plane in space, of slope j = m^T dprojection/dpoint
-    (px per unit). With the residual r (px) and the weight w, the edgel's strength times Geman and McClure's
-    1 / (1 + (r / scale)^2)^2, `equations` gets the sums of w j j^T (upper triangle, 6), w r j (3) and w over the views,
-    then the number of views that have the point in the image.
+    radius: px, of the edgels looked at. scale: px, of the robust weights.
     """
     for block in range(blocks):
         for view in range(cameras.shape[0]):
@@ -212,7 +212,7 @@ def add_equations(
                 direction = ti.Vector([directions[i, 0], directions[i, 1], directions[i, 2]])
                 pixel, slopes, along, front = project_line(camera, load_point(points, i), direction)
                 if front and is_inside(pixel, height, width):
-                    equations[i, 10] = equations[i, 10] + 1.0  # += would be atomic
+                    equations[i, VIEWS] = equations[i, VIEWS] + 1.0  # += would be atomic
                     element = nearest_edgel(view, pixel, along, radius, most_sine, rows, columns, starts, elements)
                     if element >= 0:
                         add_plane(i, element, pixel, slopes, elements, strengths[element], scale, equations)

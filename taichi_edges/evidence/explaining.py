@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taichi_edges.arrays.columns import Columns
 from taichi_edges.evidence.lying import EdgelsAbout, steadiness
 
 ROUNDS = 4  # owners whose own support turns out weak lose their edgels in the next round
@@ -23,7 +24,7 @@ VIEWS_AT_ONCE = 16
 
 
 @dataclass(frozen=True)
-class Explained:
+class Explained(Columns):
     """What edgels say about points when each of them counts for one edge alone.
 
     support: (n,) share of the views that have a point in the image in which it lies on an edgel of its own edge.
@@ -42,10 +43,6 @@ class Explained:
     def tight_px(self):
         """Residual up to which an edgel lies on an edge."""
         return max(TIGHT_PX, TIGHT_NOISES * self.noise_px)
-
-    def keep(self, chosen):
-        """What is said about the chosen points only. chosen: (n,) bool or indices."""
-        return Explained(self.support[chosen], self.steadiness[chosen], self.spread[chosen], self.noise_px)
 
 
 def explain(matching, refined):

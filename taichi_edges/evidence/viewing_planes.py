@@ -5,9 +5,11 @@ is the edge: its direction is what all planes have in common, its place their ro
 image loss converges to, but the loss sees grey levels of drawn lines, and these planes the sub-pixel points themselves.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
+
+from taichi_edges.arrays.columns import Columns
 
 RADII_PX = (3.0, 2.0, 1.5, 1.2, 1.0, 1.0)  # of the edgels that are looked at, round by round
 LEAST_SPREAD = 0.02  # planes that lean against each other less (squared sine) say nothing across their common side
@@ -15,7 +17,7 @@ LINE_SPREAD = 0.25  # the planes' third eigenvalue over the second, below which 
 
 
 @dataclass(frozen=True)
-class RefinedPoints:
+class RefinedPoints(Columns):
     """Oriented points and what supports them.
 
     points, directions: (n, 3) unit cube, unit vectors. views: (n,) number of views in which an edgel lies on the point,
@@ -30,18 +32,6 @@ class RefinedPoints:
     support: np.ndarray
     spread: np.ndarray
 
-    def __len__(self):
-        return len(self.points)
-
-    def keep(self, chosen):
-        """Only the chosen ones. chosen: (n,) bool or indices."""
-        return RefinedPoints(*(getattr(self, field.name)[chosen] for field in fields(self)))
-
-    def joined(self, other):
-        """These points and then the others."""
-        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
-        return RefinedPoints(*(np.concatenate(pair) for pair in pairs))
-
 
 def refine_points(matching, points, directions, radii=RADII_PX):
     """Points and directions moved to the robust intersection of the viewing planes of their edgels.
@@ -52,29 +42,23 @@ def refine_points(matching, points, directions, radii=RADII_PX):
     points, directions = np.array(points, np.float64), np.array(directions, np.float64)
     for radius in radii:
         equations = matching.equations(points, directions, radius, matching.scale_px)
-        steps, directions = _solve(equations.astype(np.float64), directions)
+        steps, directions = _solve(equations, directions)
         lengths = np.linalg.norm(steps, axis=1, keepdims=True)
         points += steps * np.minimum(1.0, radius * matching.pixel / np.maximum(lengths, 1e-300))
-    equations = matching.equations(points, directions, radii[-1], matching.scale_px).astype(np.float64)
-    weight, seen = equations[:, 9], np.maximum(equations[:, 10], 1.0)
-    values, _ = _principal_axes(equations)
-    spread = np.maximum(values[:, 1], 0.0) / np.maximum(values[:, 2], 1e-12)
-    return RefinedPoints(points, directions, weight, weight / seen, spread)
-
-
-def _principal_axes(equations):
-    """Eigenvalues (n, 3), ascending, and axes (n, 3, 3) of the viewing planes' normals."""
-    rows, columns = np.triu_indices(3)
-    matrices = np.empty((len(equations), 3, 3))
-    matrices[:, rows, columns] = matrices[:, columns, rows] = equations[:, :6]
-    return np.linalg.eigh(matrices)
+    equations = matching.equations(points, directions, radii[-1], matching.scale_px)
+    values = np.linalg.eigh(equations.matrices)[0]
+    spread, views = np.maximum(values[:, 1], 0.0) / np.maximum(values[:, 2], 1e-12), equations.weights
+    return RefinedPoints(points, directions, views, views / np.maximum(equations.views, 1.0), spread)
 
 
 def _solve(equations, directions):
-    """Steps (n, 3) across the common direction of the planes, and that direction where there is one."""
-    values, axes = _principal_axes(equations)
+    """Steps (n, 3) across the common direction of the planes, and that direction where there is one.
+
+    equations: PlaneEquations. directions: (n, 3), so far.
+    """
+    values, axes = np.linalg.eigh(equations.matrices)  # of the planes' normals, ascending
     sides = axes[:, :, 1:]  # (n, 3, 2)
-    pulls = np.einsum("nck,nc->nk", sides, equations[:, 6:9])
+    pulls = np.einsum("nck,nc->nk", sides, equations.gradients)
     firm = values[:, 1:] > LEAST_SPREAD * np.maximum(values[:, 2:], 1e-12)
     steps = -np.einsum("nck,nk->nc", sides, np.where(firm, pulls / np.maximum(values[:, 1:], 1e-12), 0.0))
     common = firm[:, 0] & (values[:, 0] < LINE_SPREAD * values[:, 1])

@@ -9,11 +9,13 @@ from functools import cached_property
 
 import numpy as np
 
+from taichi_edges.arrays.columns import Columns
+from taichi_edges.arrays.robust import geman_mcclure
 from taichi_edges.fitting.arcs import FLAT, GAUSS_NEWTON, RIDGE, Arc
 
 
 @dataclass(frozen=True)
-class ArcBatch:
+class ArcBatch(Columns):
     """m stretches of lines or circles, see `arcs.Arc`.
 
     origin, tangent, bend: (m, 3). low, high: (m,). closed: (m,) bool.
@@ -30,19 +32,13 @@ class ArcBatch:
     def of(arcs: Sequence[Arc]) -> "ArcBatch":
         """From a list of Arcs."""
         vectors = (np.array([getattr(arc, name) for arc in arcs]).reshape(-1, 3) for name in VECTORS)
-        return ArcBatch(*vectors, *(np.array([getattr(arc, name) for arc in arcs]) for name in ENDS))
-
-    def __len__(self) -> int:
-        return len(self.low)
+        low, high = (np.array([getattr(arc, name) for arc in arcs], np.float64) for name in ("low", "high"))
+        return ArcBatch(*vectors, low, high, np.array([arc.closed for arc in arcs], bool))
 
     def __iter__(self) -> Iterator[Arc]:
         """One Arc after the other."""
         rows = zip(*(getattr(self, name) for name in VECTORS), *(getattr(self, name).tolist() for name in ENDS))
         return (Arc(*row) for row in rows)
-
-    def keep(self, chosen: np.ndarray) -> "ArcBatch":
-        """The chosen ones. chosen: (m,) bool or indices."""
-        return ArcBatch(*(getattr(self, name)[chosen] for name in VECTORS + ENDS))
 
     def put(self, numbers: np.ndarray, others: "ArcBatch") -> "ArcBatch":
         """The same, those of the given numbers replaced by the ArcBatch `others`."""
@@ -154,7 +150,7 @@ def fit_batch(
         arcs = ArcBatch(arcs.origin, arcs.tangent, np.zeros_like(arcs.bend), arcs.low, arcs.high, arcs.closed)
     for _ in range(rounds):
         along, offsets = arcs.coordinates(points, of)
-        weights = 1.0 / (1.0 + (offsets**2).sum(axis=1) / tolerance**2) ** 2
+        weights = geman_mcclure((offsets**2).sum(axis=1) / tolerance**2)
         bent, terms = arcs.curvature[of], 2 if straight else 3
         values = np.stack([np.ones_like(along), sine(along, bent), versine(along, bent)][:terms])
         matrix, targets = _moments(values, offsets, weights, of, len(arcs))

@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from taichi_edges.arrays.robust import geman_mcclure
 from taichi_edges.geometry.shapes import EllipticArc, Line
 
 FLAT = 1e-9  # bend, 1 / unit-cube units, below which an arc is computed as a line
@@ -172,7 +173,7 @@ def fit_arc(
     for _ in range(rounds):
         along, offsets = arc.coordinates(points)
         tangent, inward, normal = arc.frame
-        weights = shares / (1.0 + (offsets**2).sum(axis=1) / tolerance**2) ** 2
+        weights = geman_mcclure((offsets**2).sum(axis=1) / tolerance**2, shares)
         bent, terms = arc.curvature, 2 if straight else 3
         cosine, sine = np.cos(bent * along), _sine(along, bent)
         values = np.array([np.ones_like(along), sine, _versine(along, bent)][:terms])

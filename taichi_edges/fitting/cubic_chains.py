@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from taichi_edges.arrays.robust import geman_mcclure
 from taichi_edges.geometry.bezier import bernstein, evaluate_bezier
 
 REPARAMETRIZATIONS = 4
@@ -30,7 +31,7 @@ def fit_chain(points: np.ndarray, ordering: "Ordering", tolerance: float, pieces
         curves = _fit_spline(points, arc / length, weights, pieces, closed)
         distances, parameters = nearest_on_chain(points, curves)
         arc = _reparametrize(arc, parameters, length, closed)
-        weights = 1.0 / (1.0 + (distances / tolerance) ** 2) ** 2
+        weights = geman_mcclure((distances / tolerance) ** 2)
     return curves, corrected_error(distances, 4 * (pieces + 1))  # two across each end of each piece, value and slope
 
 

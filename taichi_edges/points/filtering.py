@@ -78,7 +78,7 @@ def refined_points(points, directions, views, config, edge_threshold, generator)
     Returns points, directions, Explained and the counts of FilterCounts that this is about.
     """
     from taichi_edges.evidence.edgel_matching import EdgelMatching
-    from taichi_edges.evidence.viewing_planes import refine_points
+    from taichi_edges.evidence.viewing_planes import RefinedPoints, refine_points
     from taichi_edges.points.growing import grow_points
 
     matching = EdgelMatching(views, config.min_views - CONTINUED)
@@ -86,7 +86,8 @@ def refined_points(points, directions, views, config, edge_threshold, generator)
     supported, steady, _ = judge(matching, found, config)
     refined, sizes = found.keep(steady), [len(found), supported.sum(), steady.sum()]
     if config.harvest:  # what an unsteady point explains is a contour, and no edge is to be looked for in it
-        refined = refined.joined(harvest(matching, found.keep(supported), views, config, edge_threshold, generator))
+        more = harvest(matching, found.keep(supported), views, config, edge_threshold, generator)
+        refined = RefinedPoints.joined([refined, more])
     sizes.append(len(refined))
     if config.grow:
         least = np.full(len(refined), config.grow)

@@ -6,7 +6,7 @@ Seeds are sparse where an edge is faint or often hidden. What is found of it tel
 import numpy as np
 from scipy.spatial import cKDTree
 
-from taichi_edges.evidence.viewing_planes import refine_points
+from taichi_edges.evidence.viewing_planes import RefinedPoints, refine_points
 
 STEP_PX = 1.0  # of a step along the tangent
 RADII_PX = (1.5, 1.0, 1.0)  # of the refinement of a step
@@ -27,7 +27,7 @@ def grow_points(matching, refined, least):
             break
         tree = cKDTree(refined.points)
         newest, least = _next_points(matching, newest, tree, step, least)
-        refined = refined.joined(newest)
+        refined = RefinedPoints.joined([refined, newest])
     return refined
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, diags, identity
 from scipy.sparse.linalg import spsolve
 
+from taichi_edges.arrays.robust import widening
 from taichi_edges.evidence.edge_support import SPACING_PX, support_of
 from taichi_edges.geometry.wireframe import Wireframe
 from taichi_edges.refinement.charts import derivatives, moved, nearest_parameters, neighbors, own_unknowns
@@ -163,9 +164,9 @@ def image_equations(problem, wireframe, matching, radius):
     noise = max(support.noise_px, LEAST_NOISE_PX)
     widest = matching.scale_px
     scale = widest if radius > TIGHT_RADIUS_PX else min(widest, SCALE_NOISES * noise)
-    said = matching.equations_of(samples.points, support.edgels, scale).astype(np.float64)
     counted = _counted(wireframe, samples, pixel) * support.certainty  # what agrees by chance says nothing
-    said *= (counted * SPACING_PX / CORRELATED_PX / noise**2)[:, None]
+    said = matching.equations_of(samples.points, support.edgels, scale)
+    said = said.weighed(counted * SPACING_PX / CORRELATED_PX / noise**2)
     planes, pulls = _across(said, samples.directions)
     equations = Equations(problem.layout.size)
     for number, unknowns in enumerate(problem.layout.columns):
@@ -195,12 +196,9 @@ def _counted(wireframe, samples, pixel):
 
 
 def _across(said, directions):
-    """(n, 3, 3) matrices and (n, 3) gradients of the edgels' equations; what they say along the edge is left out."""
-    rows, columns = np.triu_indices(3)
-    matrices = np.empty((len(said), 3, 3))
-    matrices[:, rows, columns] = matrices[:, columns, rows] = said[:, :6]
+    """(n, 3, 3) matrices and (n, 3) gradients of PlaneEquations; what they say along the edge is left out."""
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    return across @ matrices @ across, (across @ said[:, 6:9, None])[:, :, 0]
+    return across @ said.matrices @ across, (across @ said.gradients[:, :, None])[:, :, 0]
 
 
 def _add_places(equations, unknowns, slopes, matrices, gradients):
@@ -338,7 +336,7 @@ def smooth_joints(wireframe):
         values = _turn(end, other_end)
         off = np.linalg.norm(values(*shapes))
         if {shape.kind for shape in shapes} != {"line"} and off < SMOOTH:
-            deviation = SMOOTH_DEVIATION * (1.0 + (off / (3 * SMOOTH_DEVIATION)) ** 2)  # Geman and McClure's weight
+            deviation = SMOOTH_DEVIATION * widening((off / (3 * SMOOTH_DEVIATION)) ** 2)
             yield Constraint((one, other), values, deviation)
 
 

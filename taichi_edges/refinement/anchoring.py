@@ -8,15 +8,17 @@ met in the image alone, and is outvoted. Then the other views have to show the l
 explain the same edgels the best founded one stays.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from taichi_edges.arrays.columns import Columns
+from taichi_edges.arrays.ranges import ragged
 from taichi_edges.evidence.edge_support import support_of
 from taichi_edges.evidence.lying import EdgelsAbout
 from taichi_edges.geometry.shapes import Line
-from taichi_edges.refinement.anchors import BEYOND_PX, anchors_of, ragged
+from taichi_edges.refinement.anchors import BEYOND_PX, anchors_of
 from taichi_edges.refinement.straight_runs import LEAST_LENGTH_PX, runs_of
 from taichi_edges.views.cameras import Cameras
 
@@ -52,7 +54,7 @@ def anchored_lines(matching, shapes):
         found = distinct(shown(matching, hypotheses(runs, anchors), free, seen_in(support)), matching, free)
         if not found:
             break
-        anchors = anchors.joined(anchors_of(runs, found, cameras, matching.pixel), len(known))
+        anchors = anchors.with_further(anchors_of(runs, found, cameras, matching.pixel), len(known))
         known += found
     return known[len(shapes) :]
 
@@ -61,7 +63,7 @@ def anchored_lines(matching, shapes):
 
 
 @dataclass(frozen=True)
-class Lines:
+class Lines(Columns):
     """Lines in space that are proposed for runs.
 
     points: (n, 2, 3) two anchors that they pass through. extents: (n, 2) parameters of their ends, 0 and 1 at these.
@@ -75,9 +77,6 @@ class Lines:
     views: np.ndarray
     closed: np.ndarray
     sizes: np.ndarray
-
-    def __len__(self):
-        return len(self.points)
 
     @property
     def ways(self):
@@ -99,18 +98,6 @@ class Lines:
     def lengths(self):
         """(n,) unit-cube units."""
         return (self.extents[:, 1] - self.extents[:, 0]) * np.linalg.norm(self.ways, axis=1)
-
-    def keep(self, chosen):
-        """Only the chosen ones. chosen: (n,) bool or indices."""
-        return Lines(*(getattr(self, field.name)[chosen] for field in fields(self)))
-
-    @staticmethod
-    def joined(several):
-        """All of some Lines."""
-        counts = np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
-        nothing = Lines(np.zeros((0, 2, 3)), np.zeros((0, 2)), *counts, *np.zeros((2, 0)))
-        columns = ([getattr(lines, field.name) for lines in (nothing, *several)] for field in fields(Lines))
-        return Lines(*map(np.concatenate, columns))
 
 
 def hypotheses(runs, anchors):
@@ -192,8 +179,8 @@ class Sight:
     def of(matching, lines, free, spacing):
         """spacing: px. free: (e,) bool, the edgels that count."""
         counts = np.maximum(np.round(lines.lengths / (spacing * lines.sizes)), 4).astype(np.int64)
-        owners = np.repeat(np.arange(len(lines)), counts)
-        share = (ragged(counts) + 0.5) / counts[owners]
+        owners, number = ragged(counts)
+        share = (number + 0.5) / counts[owners]
         parameters = lines.extents[owners, 0] + share * np.diff(lines.extents, axis=1)[owners, 0]
         way = lines.ways[owners]
         points = lines.points[owners, 0] + parameters[:, None] * way

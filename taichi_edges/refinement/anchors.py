@@ -1,9 +1,12 @@
 """Where straight 2D runs of edgels meet edges whose place is known: anchors, which give the runs their depth."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
+
+from taichi_edges.arrays.columns import Columns
+from taichi_edges.arrays.ranges import ragged
 
 BEYOND_PX = 8.0  # between the ends of edges that meet, see `junctions.REACH_PX`
 LEAST_CROSSING = 0.3  # sine of the angle in the image at which an anchor is met
@@ -12,7 +15,7 @@ CLOSE_PX = 6.0  # where such places are so near, runs may meet shapes
 
 
 @dataclass(frozen=True)
-class Anchors:
+class Anchors(Columns):
     """Where runs meet known shapes in the image, sorted by the run.
 
     runs, shapes: (n,) indices. points: (n, 3) on the shape, in the run's viewing plane. ways: (n,) px along the run.
@@ -25,22 +28,13 @@ class Anchors:
     ways: np.ndarray
     sizes: np.ndarray
 
-    def __len__(self):
-        return len(self.runs)
-
-    def keep(self, chosen):
-        """Only the chosen ones. chosen: (n,) bool or indices."""
-        return Anchors(*(getattr(self, field.name)[chosen] for field in fields(self)))
-
     def sorted(self):
         """The same in order of their runs, and along these."""
         return self.keep(np.lexsort((self.ways, self.runs)))
 
-    def joined(self, other, count):
-        """These and those on further shapes, where there are `count` shapes so far."""
-        other = replace(other, shapes=other.shapes + count)
-        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
-        return Anchors(*map(np.concatenate, pairs)).sorted()
+    def with_further(self, others, count):
+        """These and the other Anchors, those on further shapes, where there are `count` shapes so far."""
+        return Anchors.joined([self, replace(others, shapes=others.shapes + count)]).sorted()
 
 
 def anchors_of(runs, shapes, cameras, pixel):
@@ -122,11 +116,7 @@ def near_pairs(runs, pieces, cameras):
 def places_on(runs, chosen):
     """(m, 2) px places on the chosen runs, some beyond their ends, and (m,) the run of each."""
     counts = np.ceil((runs.lengths[chosen] + 2 * BEYOND_PX) / PLACE_PX).astype(np.int64) + 1
-    owners, share = np.repeat(chosen, counts), ragged(counts) / np.repeat(counts - 1, counts)
+    of, number = ragged(counts)
+    owners, share = chosen[of], number / (counts - 1)[of]
     ways = share * (runs.lengths[owners] + 2 * BEYOND_PX) - BEYOND_PX
     return runs.ends[owners, 0] + ways[:, None] * runs.along[owners], owners
-
-
-def ragged(counts):
-    """0 .. c - 1 for each of some counts c, one after the other."""
-    return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)

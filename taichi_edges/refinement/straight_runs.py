@@ -5,7 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from taichi_edges.detectors.chains import components, links_between
+from taichi_edges.arrays.columns import Columns
+from taichi_edges.arrays.components import components
+from taichi_edges.detectors.chains import links_between
 
 LINKED_PX, LINKED_BESIDE_PX = 1.6, 0.8  # edgels of one 2D edge: apart, to the side
 LINKED_COSINE = np.sqrt(1 - 0.25**2)  # between their normals, 14 degrees
@@ -18,14 +20,11 @@ LEAST_EDGELS = 5  # of a part of one
 
 
 @dataclass(frozen=True)
-class Runs:
+class Runs(Columns):
     """Straight runs of edgels. views: (n,). ends: (n, 2, 2) px."""
 
     views: np.ndarray
     ends: np.ndarray
-
-    def __len__(self):
-        return len(self.views)
 
     @property
     def lengths(self):
@@ -36,10 +35,6 @@ class Runs:
     def along(self):
         """(n, 2) unit vectors."""
         return (self.ends[:, 1] - self.ends[:, 0]) / np.maximum(self.lengths, 1e-300)[:, None]
-
-    def keep(self, chosen):
-        """Only the chosen ones. chosen: (n,) bool or indices."""
-        return Runs(self.views[chosen], self.ends[chosen])
 
 
 def runs_of(edgels, free):

@@ -1,10 +1,11 @@
 """Density control: which Gaussians go, which are doubled. Optimiser moments go along (NumPy, between steps)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from taichi_edges.arrays.columns import Columns
 from taichi_edges.evidence.support import exclusive_support
 from taichi_edges.splatting.gaussians import Gaussians
 
@@ -13,25 +14,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Population:
+class Population(Columns):
     """Gaussians with Adam's two moments, (n, 11) each, and the positional gradients since the last change, (n,)."""
 
     gaussians: Gaussians
     first_moments: np.ndarray
     second_moments: np.ndarray
     positional_gradients: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.gaussians)
-
-    def keep(self, chosen: np.ndarray) -> "Population":
-        """Only the chosen ones, with their moments. chosen: (n,) bool or indices."""
-        return Population(
-            self.gaussians[chosen],
-            self.first_moments[chosen],
-            self.second_moments[chosen],
-            self.positional_gradients[chosen],
-        )
 
 
 def cull_opacity(population: Population, minimum: float) -> Population:
@@ -63,18 +52,8 @@ def duplicate(
         return population
     chosen = np.flatnonzero((gradients - gradients.min()) / spread > share)
     chosen = np.tile(chosen, copies)[: max(maximum - len(population), 0)]
-    source = population.gaussians[chosen]
+    source = population.gaussians.keep(chosen)
     offset = generator.normal(size=(len(chosen), 3)).astype(np.float32) * np.float32(distance)
-    parts = [
-        (population.gaussians.means, source.means + offset),
-        (population.gaussians.log_scales, source.log_scales),
-        (population.gaussians.quaternions, source.quaternions),
-        (population.gaussians.opacity_logits, source.opacity_logits),
-    ]
     zeros = np.zeros((len(chosen), 11), population.first_moments.dtype)
-    return Population(
-        Gaussians(*(np.concatenate(pair) for pair in parts)),
-        np.concatenate([population.first_moments, zeros]),
-        np.concatenate([population.second_moments, zeros]),
-        np.concatenate([gradients, np.zeros(len(chosen), gradients.dtype)]),
-    )
+    moved = replace(source, means=source.means + offset)
+    return Population.joined([population, Population(moved, zeros, zeros, np.zeros(len(chosen), gradients.dtype))])

@@ -6,13 +6,15 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from taichi_edges.arrays.columns import Columns
+
 SCALE_INIT = 0.004  # unit-cube units; supplement, "Gaussian Scale"
 OPACITY_INIT = 0.08  # supplement, "Gaussian Opacity"
 MIN_CAPACITY = 4096  # a changed capacity recompiles every kernel, so capacities are powers of two from here up
 
 
 @dataclass(frozen=True)
-class Gaussians:
+class Gaussians(Columns):
     """n edge Gaussians.
 
     means: (n, 3) unit-cube units. log_scales: (n, 3) natural logarithm of the standard deviations along the three axes.
@@ -23,9 +25,6 @@ class Gaussians:
     log_scales: np.ndarray
     quaternions: np.ndarray
     opacity_logits: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.means)
 
     @property
     def opacities(self) -> np.ndarray:
@@ -41,9 +40,6 @@ class Gaussians:
         """(n, 3) unit vectors along the axis of the largest scale (paper 3.2: principal direction), sign arbitrary."""
         axes = rotation_matrices(self.quaternions)
         return np.take_along_axis(axes, self.log_scales.argmax(axis=1)[:, None, None], axis=2)[:, :, 0]
-
-    def __getitem__(self, index: np.ndarray | slice) -> "Gaussians":
-        return Gaussians(self.means[index], self.log_scales[index], self.quaternions[index], self.opacity_logits[index])
 
 
 def rotation_matrices(quaternions: np.ndarray) -> np.ndarray:

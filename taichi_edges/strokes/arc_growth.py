@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from taichi_edges.arrays.ranges import ragged
 from taichi_edges.fitting.arc_batch import ArcBatch, fit_batch
 
 INLIER = 3.0  # noises: a point on an edge lies no farther from it (99 % of those of a normal distribution in a plane)
@@ -97,8 +98,7 @@ class Cloud:
         """Numbers of the arcs, and indices of the points about them, (t,); some farther ones are among them."""
         high = np.minimum(high, low + arcs.round)
         counts = ((high - low) / (BALL * self.scale.noise)).astype(int) + 1
-        of = np.repeat(np.arange(len(arcs)), counts)
-        place = np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts, counts)
+        of, place = ragged(counts)
         step = (high - low) / counts
         centres = arcs.at((low + 0.5 * step)[of] + step[of] * place, of)
         radius = np.hypot(0.5 * step, INLIER * self.scale.noise)[of] * (1 + 1e-9)

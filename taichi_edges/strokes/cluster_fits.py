@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taichi_edges.arrays.robust import geman_mcclure
 from taichi_edges.fitting.cubic_chains import corrected_error, fewest_cubics, fit_chain
 from taichi_edges.geometry.bezier import evaluate_bezier
 from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
@@ -69,7 +70,7 @@ def fit_line(points, tolerance):
         direction = np.linalg.svd(offsets * np.sqrt(weights)[:, None], full_matrices=False)[2][0]
         along = offsets @ direction
         distances = np.linalg.norm(offsets - along[:, None] * direction, axis=1)
-        weights = 1.0 / (1.0 + (distances / tolerance) ** 2) ** 2
+        weights = geman_mcclure((distances / tolerance) ** 2)
     inliers = along[weights >= 0.25] if (weights >= 0.25).sum() >= 2 else along
     ends = np.quantile(inliers, [END_QUANTILE, 1 - END_QUANTILE]) if len(inliers) > 2 else np.sort(inliers)
     if len(inliers) > 2:  # along an edge the points lie evenly: what the quantiles leave out at each end is known

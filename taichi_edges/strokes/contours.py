@@ -28,42 +28,40 @@ WIDE_ANGLE = np.radians(45.0)  # seen over so much to either side, only a contou
 LEAST_DOUBT = 1e-6  # of a share, from 0 and 1
 
 
-def without_contours(assembly, points, directions, explained, views, config):
-    """The Assembly without what are no edges but contours, and the number of these. Arguments as for `steady_edges`.
+def without_contours(clusters, explained, views, config):
+    """The Clusters without what are no edges but contours, and the number of these. Arguments as for `steady_edges`.
 
     explained: None where nothing is known of the points' edgels; then all stays. config: the scene's `filter` section.
     """
     from taichi_edges.evidence.edgel_matching import EdgelMatching
 
     if explained is None or not config.min_evidence:
-        return assembly, 0
+        return clusters, 0
     tests = config.min_evidence, np.radians(config.min_angle)
-    edges = steady_edges(EdgelMatching(views), points, directions, assembly.labels, explained, *tests)
-    return assembly.keep(edges), int((~edges).sum())
+    edges = steady_edges(EdgelMatching(views), clusters, explained, *tests)
+    return clusters.keep(edges), int((~edges).sum())
 
 
-def steady_edges(matching, points, directions, labels, explained, least, angle=LEAST_ANGLE):
+def steady_edges(matching, clusters, explained, least, angle=LEAST_ANGLE):
     """(m,) bool: the clusters that are edges, and not where contours pass by.
 
-    matching: EdgelMatching. points, directions: (n, 3) unit cube. labels: (n,) ints, negative for none. explained:
-    Explained of the points. least: log likelihood ratio from which on a cluster is an edge. angle: radians, see
-    the module's first lines.
+    matching: EdgelMatching. clusters: Clusters. explained: Explained of their points. least: log likelihood ratio from
+    which on a cluster is an edge. angle: radians, see the module's first lines.
     Those whose points own the largest share of their views come first, and explain their edgels.
     """
-    clusters = members_of_clusters(labels)
-    tight = explained.tight_px
-    about = EdgelsAbout.of(matching, points, directions, max(ABOUT * tight, OWNED_PX))
+    members_of, tight = members_of_clusters(clusters.labels), explained.tight_px
+    about = EdgelsAbout.of(matching, clusters.points, clusters.directions, max(ABOUT * tight, OWNED_PX))
     edgels = np.where(about.within(ABOUT * tight), about.edgels, -1)
     on, owned = about.within(tight), about.within(OWNED_PX)
-    order = np.argsort([-explained.support[members].mean() for members in clusters], kind="stable")
-    spread = np.array([np.median(explained.spread[members]) for members in clusters])  # squared sines
+    order = np.argsort([-explained.support[members].mean() for members in members_of], kind="stable")
+    spread = np.array([np.median(explained.spread[members]) for members in members_of])  # squared sines
     order = order[spread[order] >= np.sin(angle) ** 2]
     usual = np.where(spread >= np.sin(WIDE_ANGLE) ** 2, CHANCE_SHARE, CONTOUR_SHARE)
-    free, edges = np.ones(len(matching.edgels) + 1, bool), np.zeros(len(clusters), bool)
+    free, edges = np.ones(len(matching.edgels) + 1, bool), np.zeros(len(members_of), bool)
     free[-1] = False
     for _ in range(ROUNDS):
         for number in order[~edges[order]]:
-            members = clusters[number]
+            members = members_of[number]
             counted = free[edgels[members]]
             views_on, views_about = (some.sum() / len(members) for some in (counted & on[members], counted))
             if likelihood_ratio(views_on, views_about, usual[number]) > least:

@@ -7,6 +7,7 @@ straight and curved stretches; the cluster is cut at both ends of every straight
 
 import numpy as np
 
+from taichi_edges.arrays.ranges import ragged
 from taichi_edges.strokes.neighbors import UNASSIGNED, members_of_clusters
 from taichi_edges.strokes.ordering import order_points
 
@@ -100,10 +101,10 @@ def stretch_costs(chain, starts, ends, noise):
 def _block_costs(chain, starts, ends, noise):
     """(2, p) costs of the stretches of one block; see `stretch_costs`. t counts all their points, in order."""
     lengths = ends - starts
+    of, place = ragged(lengths)  # (t,) the stretch, and 0, 1, .. within it
     first = np.cumsum(lengths) - lengths
-    place = np.arange(lengths.sum()) - np.repeat(first, lengths)  # (t,) 0, 1, .. within the stretch
     means = np.diff(_running_sums(chain)[np.stack([starts, ends])], axis=0)[0] / lengths[:, None]
-    offsets = chain[place + np.repeat(starts, lengths)].T - np.repeat(means.T, lengths, axis=1)  # (3, t)
+    offsets = chain[starts[of] + place].T - np.repeat(means.T, lengths, axis=1)  # (3, t)
 
     def capped(residuals, directions):  # (3, t) each; what lies along the direction is no distance
         along = (residuals * directions).sum(axis=0) ** 2 / np.maximum((directions**2).sum(axis=0), 1e-300)
@@ -114,8 +115,8 @@ def _block_costs(chain, starts, ends, noise):
     # Gram's polynomials are orthogonal over evenly spaced places, so a cubic takes no equations to solve:
     # p_1 = x, p_(k+1) = x p_k - b_k p_(k-1), where b_k = |p_k|^2 / |p_(k-1)|^2; p_0 = 1 is spent on the mean.
     b = [k**2 * (lengths**2 - k**2) / ((4 * k**2 - 1) * (lengths - 1.0) ** 2) for k in (1, 2, 3)]
-    b1, b2 = np.repeat(b[0], lengths), np.repeat(b[1], lengths)
-    x = 2.0 * place / np.repeat(lengths - 1, lengths) - 1.0
+    b1, b2 = b[0][of], b[1][of]
+    x = 2.0 * place / (lengths - 1)[of] - 1.0
     basis = [x, x**2 - b1, x * (x**2 - b1 - b2)]
     slopes = [np.ones_like(x), 2 * x, 3 * x**2 - b1 - b2]
     cubics, directions, norm = np.zeros_like(offsets), np.zeros_like(offsets), lengths.astype(float)

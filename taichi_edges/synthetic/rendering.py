@@ -108,7 +108,7 @@ def render_edge_maps(
     edge_maps = np.empty((len(intrinsics), image_size, image_size), np.uint8)
     for view, (lens, pose) in enumerate(zip(intrinsics, world_to_camera)):
         centre = camera_centre(pose)
-        samples = edges.joined(sample_contours(part, centre, spacing)) if imperfections.contours else edges
+        samples = edges.with_further(sample_contours(part, centre, spacing)) if imperfections.contours else edges
         pixels, _ = project(samples.points, lens, pose)
         visible = visible_from(scene, samples, centre) & np.isfinite(pixels).all(axis=1)
         edge_maps[view] = draw_edge_map(

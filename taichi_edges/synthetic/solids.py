@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
+from taichi_edges.arrays.components import components
 from taichi_edges.geometry.edge_set import EdgeSet
 from taichi_edges.synthetic.profiles import SHARP_ANGLE, Path, Profile
 from taichi_edges.synthetic.surfaces import Surface, cap, revolved, wall
@@ -67,10 +66,7 @@ class Part:
         ends, sides = (array[~self.mesh_edges.sharp] for array in (self.mesh_edges.ends, self.mesh_edges.sides))
         # Corners of two triangles at one vertex belong together where the edge between the triangles is smooth.
         corner = (self.triangles[sides][:, :, None, :] == ends[:, None, :, None]).argmax(axis=3) + 3 * sides[:, :, None]
-        pairs = corner.transpose(1, 0, 2).reshape(2, -1)
-        count = self.triangles.size
-        graph = coo_matrix((np.ones(pairs.shape[1], bool), tuple(pairs)), (count, count))
-        _, groups = connected_components(graph, directed=False)
+        groups = components(self.triangles.size, *corner.transpose(1, 0, 2).reshape(2, -1))
         weighted = (corner_angles(self.vertices[self.triangles])[:, :, None] * self.normals[:, None]).reshape(-1, 3)
         sums = np.stack([np.bincount(groups, weighted[:, axis]) for axis in range(3)], axis=1)
         return (sums / np.linalg.norm(sums, axis=1, keepdims=True))[groups].reshape(-1, 3, 3)

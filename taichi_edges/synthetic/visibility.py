@@ -1,11 +1,13 @@
 """Which samples of a part's edges a camera sees: hidden-line removal by ray casting, and occluding contours."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from taichi_edges.arrays.columns import Columns
+from taichi_edges.arrays.ranges import ragged
 from taichi_edges.geometry.bezier import evaluate_bezier
 
 if TYPE_CHECKING:
@@ -21,7 +23,7 @@ FLAT = 1e-9  # 1 - cosine: two triangles nearer than this lie in one plane, wher
 
 
 @dataclass(frozen=True)
-class LineSamples:
+class LineSamples(Columns):
     """Points along everything a camera may see as a line.
 
     points: (n, 3). outward: (n, 3) unit directions away from the solid. chains: (n,) int; consecutive points of one
@@ -33,14 +35,11 @@ class LineSamples:
     chains: np.ndarray
     strokes: np.ndarray
 
-    def joined(self, other: "LineSamples") -> "LineSamples":
+    def with_further(self, others: "LineSamples") -> "LineSamples":
         """These samples and the others, whose chains and strokes are renumbered."""
-        return LineSamples(
-            np.concatenate([self.points, other.points]),
-            np.concatenate([self.outward, other.outward]),
-            np.concatenate([self.chains, other.chains + self.chains.max(initial=-1) + 1]),
-            np.concatenate([self.strokes, other.strokes + self.strokes.max(initial=-1) + 1]),
-        )
+        chains = others.chains + self.chains.max(initial=-1) + 1
+        strokes = others.strokes + self.strokes.max(initial=-1) + 1
+        return LineSamples.joined([self, replace(others, chains=chains, strokes=strokes)])
 
 
 def ray_scene(part: "Part") -> "RaycastingScene":
@@ -58,8 +57,7 @@ def sample_segments(starts: np.ndarray, ends: np.ndarray, spacing: float) -> tup
     Returns points (n, 3) and (n,) the index of the segment.
     """
     counts = np.maximum(np.ceil(np.linalg.norm(ends - starts, axis=1) / spacing).astype(np.int64), 1) + 1
-    owners = np.repeat(np.arange(len(starts)), counts)
-    within = np.arange(len(owners)) - np.repeat(np.cumsum(counts) - counts, counts)
+    owners, within = ragged(counts)
     fractions = (within / (counts[owners] - 1))[:, None]
     return (1.0 - fractions) * starts[owners] + fractions * ends[owners], owners
 

@@ -1,0 +1,1 @@
+"""NumPy that several rooms share."""
