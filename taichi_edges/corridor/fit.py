@@ -1,19 +1,24 @@
 """The stage `fit`: a shape for each cluster of points."""
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from taichi_edges.geometry.wireframe import write_wireframe
 from taichi_edges.views.views import read_views
 
+if TYPE_CHECKING:
+    from taichi_edges.corridor.pipeline import Run
 
-def fit(run):
+
+def fit(run: "Run") -> dict[str, Any]:
     """`clusters.npz` -> `edges_fit.json` (input frame): edges that do not meet yet."""
     from taichi_edges.strokes.assembly import fit_assembly
 
     views = read_views(run.path("views.npz"))
     with np.load(run.path("clusters.npz")) as archive:
-        parts = (archive[name] for name in ("points", "labels", "shared", "arcs"))
-        edges, counts = fit_assembly(*parts, run.config.fit)
+        points, labels, shared, arcs = (archive[name] for name in ("points", "labels", "shared", "arcs"))
+    edges, counts = fit_assembly(points, labels, shared, arcs, run.config.fit)
     clusters = {kind: counts[kind] for kind in ("line", "curve", "loop", "short", "degenerate")}
     about = {"frame": "input", "clusters": clusters, "scene": run.config.name, "seed": run.config.seed}
     write_wireframe(
