@@ -1,7 +1,7 @@
 """The one exception for everything a user can cause and put right."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 
 class UserError(Exception):
@@ -21,7 +21,7 @@ def did_you_mean(name: object, known: Iterable[object]) -> str:
     return f"; did you mean '{near[0]}'?" if near else ""
 
 
-def refuse_unknown(option: str, value: object, what: str, known: Iterable[str]) -> None:
+def refuse_unknown(option: str, value: object, what: str, known: Collection[str]) -> None:
     """UserError where the value of an option is none of those known. what: 'stage'. None is no value, and passes."""
     if value is not None and value not in known:
         hint = f"there is {', '.join(known)}{did_you_mean(value, known)}"

@@ -5,13 +5,16 @@ border of the edge map without crossing a line; photographs of a scene without a
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from taichi_edges.arrays.columns import Columns
 from taichi_edges.calibration.offsets import Observations
 from taichi_edges.detectors.ridges import gaussian_derivatives
+from taichi_edges.views.edgels import Edgels
 
 FAINT = 0.15  # of full scale; where an edge map is brighter, the flood does not pass
 CLOSED_GAP = 4.0  # px; half the width of the gaps in an outline through which the flood does not leak
@@ -49,7 +52,7 @@ class Sides(Columns):
     steps: np.ndarray
     from_alpha: np.ndarray
 
-    def silhouettes(self, shift=(0.0, 0.0)):
+    def silhouettes(self, shift: ArrayLike = (0.0, 0.0)) -> np.ndarray:
         """(n,) 0..1: how surely each edgel, of maps shifted by so many px, is on a silhouette.
 
         That is where the background begins as far from it as it usually does; an edge farther inside is another one.
@@ -63,12 +66,12 @@ class Sides(Columns):
                 weights[some] *= smooth_step((DEPTH_NONE - off) / (DEPTH_NONE - DEPTH_FULL))
         return weights
 
-    def correct(self, edgels, values):
+    def correct(self, edgels: Edgels, values: np.ndarray) -> tuple[Edgels, np.ndarray]:
         """The n edgels without the biases (3,) px: outward offset of silhouettes, shift; and (n,) `silhouettes`."""
         weights = self.silhouettes(values[1:])
         return edgels.moved(-values[1:] - values[0] * weights[:, None] * self.outward), weights
 
-    def observations(self, views, shift=(0.0, 0.0)):
+    def observations(self, views: np.ndarray, shift: ArrayLike = (0.0, 0.0)) -> Observations:
         """Observations of the edgels of maps shifted by so many px against the images. views: (n,) int.
 
         Silhouettes are held against the outline in the alpha channel only: an image without one may show the object
@@ -82,13 +85,15 @@ class Sides(Columns):
         return Observations(-places[chosen], self.outward[chosen], flags, chosen, views[chosen])
 
 
-def smooth_step(x):
+def smooth_step(x: np.ndarray) -> np.ndarray:
     """0 below 0, 1 above 1, and smooth in between."""
     x = np.clip(x, 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
 
 
-def look_beside(edge_map, image_path, points, normals, width_px):
+def look_beside(
+    edge_map: np.ndarray, image_path: Path | str, points: np.ndarray, normals: np.ndarray, width_px: float
+) -> Sides:
     """Sides of the edgels (n, 2), (n, 2) of one view, whose lines are about `width_px` wide."""
     grey, alpha = read_picture(image_path, edge_map.shape)
     if alpha is not None:
@@ -110,7 +115,7 @@ def look_beside(edge_map, image_path, points, normals, width_px):
     return Sides(outward, contrast, depths, interior, steps, np.full(len(points), alpha is not None))
 
 
-def read_picture(path, shape):
+def read_picture(path: Path | str, shape: tuple[int, ...]) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Grey values (H, W) float32, composited over white, and alpha (H, W) float32 in 0..1; None for what there is not.
 
     An image of another size than the edge map says nothing about its pixels.
@@ -129,7 +134,7 @@ def read_picture(path, shape):
     return alpha * grey + 255.0 * (1.0 - alpha), alpha
 
 
-def flooded(edge_map):
+def flooded(edge_map: np.ndarray) -> np.ndarray:
     """(H, W) float32: 1 where the background is, flooded from the border of an edge map, else 0."""
     dark = (edge_map < 255 * FAINT).astype(np.uint8)
     open_ = (cv2.distanceTransform(np.pad(dark, 1, constant_values=1), cv2.DIST_L2, 5) > CLOSED_GAP).astype(np.uint8)
@@ -142,7 +147,7 @@ def flooded(edge_map):
     return (near & (dark > 0)).astype(np.float32)
 
 
-def sample(image, points, directions, along):
+def sample(image: np.ndarray, points: np.ndarray, directions: np.ndarray, along: np.ndarray) -> np.ndarray:
     """(n, k) bilinear values of an (H, W) image at points (n, 2) + along (k,) * directions (n, 2), pixels (u, v).
 
     Outside the image its border goes on.
@@ -157,7 +162,7 @@ def sample(image, points, directions, along):
     return upper * (1 - down) + lower * down
 
 
-def image_steps(grey, points, directions):
+def image_steps(grey: np.ndarray, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """(n,) px along `directions` from each point to the one strong step of an image's brightness across it, or NaN."""
     along = np.arange(-STEP_REACH - 1, STEP_REACH + 1.25, ALONG_STEP)
     slopes, derivatives = 0.0, gaussian_derivatives(grey, STEP_SIGMA)

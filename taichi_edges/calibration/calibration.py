@@ -6,15 +6,20 @@ measured in two ways: against the colour images, where there are any, and throug
 on. Of each bias the surer estimate counts, and it is corrected where it is significant.
 """
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from taichi_edges.calibration.backgrounds import CLEAR, Sides, look_beside
 from taichi_edges.calibration.consensus import Consensus
 from taichi_edges.calibration.offsets import LEAST_OBSERVATIONS, MOST_RESIDUAL, Estimate, fit_offsets, standard_errors
 from taichi_edges.evidence.support import line_width
+from taichi_edges.views.edgels import Edgels
+from taichi_edges.views.views import Views
 
 SURE, WORTH_PX = 3.0, 0.1  # a bias is corrected from so many standard errors and so many pixels on
 UNKNOWN_PX = 2.0  # a standard error beyond says that the bias has not been measured
@@ -48,7 +53,7 @@ class Calibration:
     outward: np.ndarray
     reason: str
 
-    def facts(self):
+    def facts(self) -> dict[str, Any]:
         """JSON-able: the biases and how well the corrected edgels of all views agree."""
         explained, silhouettes = np.isfinite(self.residuals), self.on_silhouette >= CLEAR
         return {
@@ -69,23 +74,31 @@ class Calibration:
         }
 
 
-def _mean(values):
+def _mean(values: np.ndarray) -> float:
     return float(np.mean(values)) if len(values) else 0.0
 
 
-def _median(values):
+def _median(values: np.ndarray) -> float:
     return float(np.median(values)) if len(values) else np.nan
 
 
-def _rounded(values):
+def _rounded(values: ArrayLike) -> Any:
     """Floats of four decimals, nested as the array is; None for what is not finite."""
-    values = np.asarray(values, np.float64)
-    if values.ndim:
-        return [_rounded(value) for value in values]
-    return round(values.item(), 4) if np.isfinite(values) else None
+    array = np.asarray(values, np.float64)
+    if array.ndim:
+        return [_rounded(value) for value in array]
+    return round(array.item(), 4) if np.isfinite(array) else None
 
 
-def calibrate(views, edgels, points, directions, fixed_shift=None, fixed_silhouette=None, threads=None):
+def calibrate(
+    views: Views,
+    edgels: Edgels,
+    points: np.ndarray,
+    directions: np.ndarray,
+    fixed_shift: Sequence[float] | np.ndarray | None = None,
+    fixed_silhouette: float | None = None,
+    threads: int | None = None,
+) -> tuple[Edgels, Calibration]:
     """The edgels of a detector's maps without its biases, and the Calibration.
 
     views: Views with the maps as the detector gave them. edgels: n Edgels of those. points, directions: (p, 3) unit
@@ -110,11 +123,11 @@ def calibrate(views, edgels, points, directions, fixed_shift=None, fixed_silhoue
     )
 
 
-def sides_of(views, edgels, threads=None):
+def sides_of(views: Views, edgels: Edgels, threads: int | None = None) -> Sides:
     """Sides of all edgels."""
     width_px, _ = line_width(views, EDGE_LEVEL)
 
-    def look(view):
+    def look(view: int) -> Sides:
         points, normals, _ = edgels.of_view(view)
         return look_beside(views.edge_maps[view], views.image_paths[view], points, normals, width_px)
 
@@ -122,7 +135,7 @@ def sides_of(views, edgels, threads=None):
         return Sides.joined(list(pool.map(look, range(len(views)))))
 
 
-def _by_images(sides, edgels, known):
+def _by_images(sides: Sides, edgels: Edgels, known: np.ndarray) -> Estimate | None:
     """Estimate against the colour images; None where they show too little, or other edges."""
     shift = np.where(np.isnan(known[1:]), 0.0, known[1:])
     for _ in range(2):  # which edgels are on silhouettes is known better when the shift is
@@ -136,7 +149,7 @@ def _by_images(sides, edgels, known):
     return Estimate(fit.values, standard_errors(observations, fit, known), "images")
 
 
-def _by_points(consensus, by_images, known):
+def _by_points(consensus: Consensus, by_images: Estimate | None, known: np.ndarray) -> tuple[Estimate | None, str]:
     """Estimate through 3D points, or None, and then why, or ''.
 
     Where the cameras stand alike a shift is hard to tell from a displacement of all points, which takes the silhouettes
@@ -162,17 +175,17 @@ class _Choice:
     applied: bool
 
     @property
-    def applied_values(self):
+    def applied_values(self) -> np.ndarray:
         return self.values * self.applied
 
 
-def _choose(part, known, estimates):
+def _choose(part: slice, known: np.ndarray, estimates: Sequence[Estimate]) -> _Choice:
     """_Choice of one part of the (3,) px: what is known, or else the surest of the estimates."""
     if not np.isnan(known[part]).any():
         return _Choice(known[part], np.zeros_like(known[part]), "fixed", bool(known[part].any()))
     if not estimates:
         return _Choice(np.zeros_like(known[part]), np.full_like(known[part], np.nan), "none", False)
-    best = min(estimates, key=lambda estimate: np.linalg.norm(estimate.errors[part]))
+    best = min(estimates, key=lambda estimate: float(np.linalg.norm(estimate.errors[part])))
     if np.linalg.norm(best.errors[part]) > UNKNOWN_PX:  # nothing has been observed of it, a prior alone keeps it finite
         return _Choice(np.zeros_like(known[part]), np.full_like(known[part], np.nan), "none", False)
     values, errors = best.values[part], best.errors[part]

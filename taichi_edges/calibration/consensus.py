@@ -1,22 +1,28 @@
 """What edgels of many views say together: 3D points on edges, each displaced a little so that all views agree."""
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import numpy as np
 
-from taichi_edges.calibration.backgrounds import CLEAR
+from taichi_edges.calibration.backgrounds import CLEAR, Sides
 from taichi_edges.calibration.offsets import (
     LEAST_OBSERVATIONS,
     MOST_RESIDUAL,
     NORMAL_MAD,
     Estimate,
     Observations,
+    OffsetFit,
     camera_leverage,
     fit_offsets,
     standard_errors,
 )
 from taichi_edges.views.cameras import NEAR, inside_image
-from taichi_edges.views.views import pixel_size
+from taichi_edges.views.edgels import Edgels
+from taichi_edges.views.views import Views, pixel_size
+
+Found = TypeVar("Found")
 
 LEAST_POINTS, MOST_POINTS = 50, 3000  # fewer are no use; more only cost time: each is seen by most of the views
 REACHES = (5.0, 3.0)  # px around a 3D point within which an edgel may be its, round by round
@@ -53,14 +59,22 @@ class Consensus:
     points, directions: (p, 3) unit cube, and unit vectors along the edges.
     """
 
-    def __init__(self, views, edgels, sides, points, directions, threads=None):
+    def __init__(
+        self,
+        views: Views,
+        edgels: Edgels,
+        sides: Sides,
+        points: np.ndarray,
+        directions: np.ndarray,
+        threads: int | None = None,
+    ) -> None:
         count = len(points)
         chosen = np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(np.int64)
         self.points, self.directions = (np.asarray(array, np.float64)[chosen] for array in (points, directions))
         self.views, self.edgels, self.sides, self.threads = views, edgels, sides, threads
         self.pixel, self.across = pixel_size(views), across(self.directions)
 
-    def estimate(self, known, start):
+    def estimate(self, known: np.ndarray, start: np.ndarray) -> tuple[Estimate | None, str]:
         """Estimate of the biases, or None, and then why, or ''. known: (3,) px, NaN where unknown. start: a guess."""
         if len(self.points) < LEAST_POINTS:
             return None, f"{len(self.points)} 3D points are too few to calibrate with; {LEAST_POINTS} are needed"
@@ -76,11 +90,11 @@ class Consensus:
         if len(observations) >= LEAST_OBSERVATIONS:
             observations = self._without_odd_views(observations, known)
             observations = self._steady(observations, fit_offsets(observations, known, len(self.points)))
-        if len(observations) < LEAST_OBSERVATIONS or len(np.unique(observations.owners)) < LEAST_POINTS:
+        if len(observations) < LEAST_OBSERVATIONS or np.count_nonzero(self._counts(observations)) < LEAST_POINTS:
             return None, "nearly all 3D points are on silhouettes only, or not steady"
         return self._weighed(observations, known)
 
-    def _weighed(self, observations, known):
+    def _weighed(self, observations: Observations, known: np.ndarray) -> tuple[Estimate | None, str]:
         """Estimate from the observations, or None, and then why, or ''."""
         fit = fit_offsets(observations, known, len(self.points))
         residual = np.median(np.abs(fit.residuals))
@@ -91,7 +105,7 @@ class Consensus:
         own = OWN_ERRORS * residual * np.isnan(known)
         return Estimate(fit.values, np.sqrt(errors**2 + cameras**2 + own**2), "points"), ""
 
-    def observe(self, values, reach):
+    def observe(self, values: np.ndarray, reach: float) -> Observations:
         """Observations of the points by edgels, sought without the biases `values`, (3,) px, at most `reach` px away.
 
         Edgels that are neither surely on silhouettes nor surely inside are left out.
@@ -99,7 +113,7 @@ class Consensus:
         corrected, weights = self.sides.correct(self.edgels, values)
         flags = np.where(weights >= CLEAR, 1.0, np.where(self.sides.interior, 0.0, np.nan))
 
-        def look(view):
+        def look(view: int) -> tuple[np.ndarray, ...]:
             owners, found = self._edgels_beside(view, corrected, reach)
             found += self.edgels.starts[view]
             owners, found = (array[np.isfinite(flags[found])] for array in (owners, found))
@@ -111,7 +125,7 @@ class Consensus:
 
         return Observations.joined(self._for_each_view(look))
 
-    def residuals(self, values):
+    def residuals(self, values: np.ndarray) -> np.ndarray:
         """(n,) px from the 3D point that explains an edgel to it, without the biases, outward; NaN where none does.
 
         The points are moved to fit those biases first. A point with edgels to spare explains those that are its own,
@@ -125,37 +139,37 @@ class Consensus:
         placed = self._counts(observations) > 0
         return np.concatenate(self._for_each_view(lambda view: self._residuals_in(view, corrected, placed)))
 
-    def _for_each_view(self, look):
+    def _for_each_view(self, look: Callable[[int], Found]) -> list[Found]:
         with ThreadPoolExecutor(self.threads) as pool:  # NumPy releases the lock in the long loops
             return list(pool.map(look, range(len(self.views))))
 
-    def _move(self, fit):
+    def _move(self, fit: OffsetFit) -> None:
         moves = np.clip(fit.displacements, -FARTHEST_PX, FARTHEST_PX)
         self.points = self.points + self.pixel * np.einsum("nk,nkj->nj", moves, self.across)
 
-    def _redundant(self, observations, least=LEAST_REDUNDANT):
+    def _redundant(self, observations: Observations, least: float = LEAST_REDUNDANT) -> Observations:
         """The observations of points that have at least so many."""
         return observations.keep((self._counts(observations) >= least)[observations.owners])
 
-    def _well_seen(self, observations):
+    def _well_seen(self, observations: Observations) -> Observations:
         """The observations of points that enough views see to tell biases."""
         return self._redundant(observations, max(LEAST_SEEN, LEAST_SEEN_SHARE * len(self.views)))
 
-    def _balanced(self, observations):
+    def _balanced(self, observations: Observations) -> Observations:
         """The observations of points that are seen inside often enough."""
         counts = self._counts(observations)
         silhouettes = self._counts(observations, observations.silhouette)
         enough = (counts - silhouettes >= LEAST_INSIDE) & (silhouettes <= MOST_SILHOUETTE * counts)
         return observations.keep(enough[observations.owners])
 
-    def _without_odd_views(self, observations, known):
+    def _without_odd_views(self, observations: Observations, known: np.ndarray) -> Observations:
         """The observations without silhouettes of views that disagree with the others on how far outside they lie.
 
         That is told from points placed by edgels inside alone.
         """
         outside = observations.silhouette > 0
         placed = fit_offsets(observations.keep(~outside), np.append(0.0, known[1:]), len(self.points))
-        moved = (observations.slopes * placed.displacements[observations.owners]).sum(axis=1)
+        moved = observations.moved_by(placed.displacements)
         offsets = observations.offsets - observations.normals @ placed.values[1:] - moved
         middles = np.full(len(self.views), np.nan)
         for view in np.flatnonzero(np.bincount(observations.views[outside]) >= LEAST_IN_VIEW):
@@ -165,7 +179,7 @@ class Consensus:
         odd = np.abs(middles - np.nanmedian(middles)) > ODD_PX
         return observations.keep(~(outside & odd[observations.views]))
 
-    def _steady(self, observations, fit):
+    def _steady(self, observations: Observations, fit: OffsetFit) -> Observations:
         """The observations of points that most of their edgels agree with, on silhouettes as well as inside."""
         sizes = np.abs(fit.residuals)
         agree = sizes <= max(AGREEING_PX, AGREEING_SCALES * NORMAL_MAD * np.median(sizes))
@@ -174,11 +188,12 @@ class Consensus:
             steady &= self._counts(observations, kind & agree) >= STEADY_SHARE * self._counts(observations, kind)
         return observations.keep(steady[observations.owners])
 
-    def _counts(self, observations, weights=None):
+    def _counts(self, observations: Observations, weights: np.ndarray | None = None) -> np.ndarray:
         """(p,) of each point the number of its observations, or the sum of their weights."""
+        assert observations.owners is not None
         return np.bincount(observations.owners, weights, len(self.points))
 
-    def _residuals_in(self, view, edgels, placed):
+    def _residuals_in(self, view: int, edgels: Edgels, placed: np.ndarray) -> np.ndarray:
         """`residuals` of one view's edgels. placed: (p,) bool, the points that may explain any."""
         places, normals, _ = edgels.of_view(view)
         residuals = np.full(len(places), np.nan)
@@ -194,14 +209,14 @@ class Consensus:
         residuals[others[explained]] = offsets[explained]
         return residuals
 
-    def _edgels_beside(self, view, edgels, reach):
+    def _edgels_beside(self, view: int, edgels: Edgels, reach: float) -> tuple[np.ndarray, np.ndarray]:
         """Points (m,) and, for each, the edgel (m,) of the view nearest to its projection across the edge, at most
         `reach` px away; only where no other edge is near.
         """
         places, normals, _ = edgels.of_view(view)
         pixels, across_edge = projected_normals(self.views, view, self.points, self.directions)
-        seen = inside_image(pixels, self.views.width, self.views.height) & np.isfinite(across_edge[:, 0])
-        seen = np.flatnonzero(seen)
+        inside = inside_image(pixels, self.views.width, self.views.height)
+        seen = np.flatnonzero(inside & np.isfinite(across_edge[:, 0]))
         pixels, across_edge = pixels[seen], across_edge[seen]
         rows, found = _walk(edgel_table(places, (self.views.height, self.views.width)), pixels, across_edge)
         offsets = ((places[found] - pixels[rows]) * across_edge[rows]).sum(axis=1)
@@ -215,7 +230,7 @@ class Consensus:
         return seen[rows[nearest]], found[nearest].astype(np.int64)
 
 
-def across(directions):
+def across(directions: np.ndarray) -> np.ndarray:
     """(n, 2, 3): two unit vectors at right angles to each of the (n, 3) unit vectors, and to each other."""
     least = np.eye(3)[np.abs(directions).argmin(axis=1)]
     first = np.cross(directions, least)
@@ -223,7 +238,9 @@ def across(directions):
     return np.stack([first, np.cross(directions, first)], axis=1)
 
 
-def projected_normals(views, view, points, directions):
+def projected_normals(
+    views: Views, view: int, points: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Projections (n, 2) and unit normals (n, 2) of the lines there, px; NaN where a line is seen end-on."""
     pixels, depths = views.project(points, view)
     safe = np.where((depths > NEAR)[:, None], points, np.nan)
@@ -235,7 +252,7 @@ def projected_normals(views, view, points, directions):
     return pixels, np.stack([-along[:, 1], along[:, 0]], axis=1)
 
 
-def edgel_table(places, shape):
+def edgel_table(places: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """(H + 2, W + 2) int32: the edgel at each pixel, or beside it where it has none of its own; -1 where there is none.
 
     The table has a border of one pixel. A walk across a line cannot slip between its diagonal neighbours.
@@ -248,7 +265,7 @@ def edgel_table(places, shape):
     return table
 
 
-def _walk(table, pixels, directions):
+def _walk(table: np.ndarray, pixels: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The edgels met on walks through pixels (n, 2) along directions (n, 2): which walk (k,), and which edgel (k,)."""
     along = np.arange(-WALK, WALK + STEP / 2, STEP, dtype=np.float32)
     columns, rows = (
@@ -260,7 +277,9 @@ def _walk(table, pixels, directions):
     return walks, found[walks, steps]
 
 
-def _neighbours(table, places, normals, found):
+def _neighbours(
+    table: np.ndarray, places: np.ndarray, normals: np.ndarray, found: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Edgels (k,) next to those in `found` (m,) along the line, themselves included, and to which of those, (k,)."""
     tangents = np.stack([-normals[found, 1], normals[found, 0]], axis=1)
     spots = np.rint(places[found] + np.asarray(BESIDE)[:, None, None] * tangents).astype(np.int64) + 1  # (5, m, 2)
@@ -270,7 +289,7 @@ def _neighbours(table, places, normals, found):
     return others[steps, rows], rows
 
 
-def _at(table, rows, columns):
+def _at(table: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """The table's values at rows and columns, which may lie beyond it."""
     rows, columns = np.clip(rows, 0, table.shape[0] - 1), np.clip(columns, 0, table.shape[1] - 1)
     return table.reshape(-1)[rows * table.shape[1] + columns]

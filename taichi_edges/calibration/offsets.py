@@ -45,9 +45,15 @@ class Observations(Columns):
     slopes: np.ndarray | None = None
 
     @property
-    def columns(self):
+    def columns(self) -> np.ndarray:
         """(m, 3): what each observation sees of the outward offset and of the shift's two coordinates."""
         return np.column_stack([self.silhouette, self.normals])
+
+    def moved_by(self, displacements: np.ndarray) -> np.ndarray:
+        """(m,) px by which displacements (n, 2) px of the points move the references; 0 where those are exact."""
+        if self.owners is None or self.slopes is None:
+            return np.zeros(len(self))
+        return (self.slopes * displacements[self.owners]).sum(axis=1)
 
 
 @dataclass(frozen=True)
@@ -55,14 +61,14 @@ class OffsetFit:
     """What fits m observations best.
 
     values:        (3,) px: outward offset of silhouettes, shift in x and y.
-    displacements: (n, 2) px, of the points; None where there are none.
+    displacements: (n, 2) px, of the points; n is 0 where there are none.
     residuals:     (m,) px, offset - model.
     weights:       (m,) of the observations in the end; robust: (m,) 0..1, the part that their residuals have in them.
     matrix:        (3, 3) of the values' normal equations.
     """
 
     values: np.ndarray
-    displacements: np.ndarray | None
+    displacements: np.ndarray
     residuals: np.ndarray
     weights: np.ndarray
     robust: np.ndarray
@@ -78,7 +84,7 @@ class Estimate:
     method: str
 
 
-def fit_offsets(observations, known, count=None):
+def fit_offsets(observations: Observations, known: np.ndarray, count: int | None = None) -> OffsetFit:
     """The OffsetFit of observations. known: (3,) px values that are taken as they are, NaN where they are fitted.
 
     count: number of 3D points, the owners, where there are any; their displacements are fitted too.
@@ -93,7 +99,9 @@ def fit_offsets(observations, known, count=None):
     return OffsetFit(values, displacements, residuals, weights * robust, robust, matrix)
 
 
-def standard_errors(observations, fit, known, points=None):
+def standard_errors(
+    observations: Observations, fit: OffsetFit, known: np.ndarray, points: np.ndarray | None = None
+) -> np.ndarray:
     """(3,) px: standard errors of a fit's values, 0 where they are known. points: (n, 3) unit cube, the owners.
 
     Observations in one view, and those of points near each other, err alike; a plain standard error would count them
@@ -110,7 +118,7 @@ def standard_errors(observations, fit, known, points=None):
     return np.where(np.isnan(known), np.sqrt(variances) * _stiffness(fit.robust), 0.0)
 
 
-def camera_leverage(observations, fit, known, count):
+def camera_leverage(observations: Observations, fit: OffsetFit, known: np.ndarray, count: int) -> np.ndarray:
     """(3,): standard errors of the values for cameras that are wrong by 1 px in each image coordinate, each by itself.
 
     A shift of the maps is hard to tell from a displacement of all points where the cameras stand alike, and then small
@@ -120,6 +128,7 @@ def camera_leverage(observations, fit, known, count):
     weighted = columns * fit.weights[:, None]
     inverses, crossed, _ = _point_equations(observations, fit.weights, weighted, observations.offsets, count)
     # What moving one observation by 1 px does to the values, once the points have given way.
+    assert observations.slopes is not None
     moved = np.einsum("mk,mkj->mj", observations.slopes, (inverses @ crossed)[observations.owners])
     influences = (columns - moved) * fit.weights[:, None] @ np.linalg.inv(fit.matrix)
     sums = [
@@ -130,7 +139,7 @@ def camera_leverage(observations, fit, known, count):
     return np.sqrt((np.array(sums).reshape(3, -1) ** 2).sum(axis=1))
 
 
-def _stiffness(robust):
+def _stiffness(robust: np.ndarray) -> float:
     """By how much constant weights understate what an observation moves a robust fit: E[weight] / E[influence'].
 
     Where residuals r change the weights, w = (1 + r^2)^-2, the influence is r w and its derivative 4 w^1.5 - 3 w.
@@ -138,7 +147,7 @@ def _stiffness(robust):
     return np.clip(robust.sum() / max((4 * robust**1.5 - 3 * robust).sum(), 1e-9), 1.0, MOST_STIFF)
 
 
-def _weights(residuals, redescending):
+def _weights(residuals: np.ndarray, redescending: bool) -> np.ndarray:
     """(m,) IRLS weights: of least absolute values, or Geman and McClure's at the residuals' own scale."""
     sizes = np.abs(residuals)
     if not redescending:
@@ -147,14 +156,13 @@ def _weights(residuals, redescending):
     return geman_mcclure((residuals / scale) ** 2)
 
 
-def _residuals(observations, values, displacements):
-    residuals = observations.offsets - observations.columns @ values
-    if displacements is None:
-        return residuals
-    return residuals - (observations.slopes * displacements[observations.owners]).sum(axis=1)
+def _residuals(observations: Observations, values: np.ndarray, displacements: np.ndarray) -> np.ndarray:
+    return observations.offsets - observations.columns @ values - observations.moved_by(displacements)
 
 
-def _solve(observations, weights, known, count):
+def _solve(
+    observations: Observations, weights: np.ndarray, known: np.ndarray, count: int | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Weighted least squares: values (3,), displacements (count, 2), and the matrix of the values' normal equations.
 
     The points are eliminated first, each by itself (Schur complement).
@@ -165,7 +173,7 @@ def _solve(observations, weights, known, count):
     weighted = columns * weights[:, None]
     matrix = weighted.T @ columns + np.eye(3) / NOTHING_KNOWN**2
     right = weighted.T @ targets
-    displacements = None
+    displacements = np.zeros((0, 2))
     if count is not None:
         inverses, crossed, sides = _point_equations(observations, weights, weighted, targets, count)
         eliminated = inverses @ crossed
@@ -177,11 +185,14 @@ def _solve(observations, weights, known, count):
     return np.where(free, values, known), displacements, matrix
 
 
-def _point_equations(observations, weights, weighted, targets, count):
+def _point_equations(
+    observations: Observations, weights: np.ndarray, weighted: np.ndarray, targets: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of each point: inverse of its (2, 2) normal matrix, its coupling (2, 3) to the values, its right side (2,)."""
     slopes, owners = observations.slopes, observations.owners
+    assert slopes is not None and owners is not None
 
-    def sums(terms):
+    def sums(terms: np.ndarray) -> np.ndarray:
         return np.bincount(owners, terms, count)
 
     xx, xy, yy = (sums(weights * slopes[:, i] * slopes[:, j]) for i, j in ((0, 0), (0, 1), (1, 1)))
@@ -192,7 +203,9 @@ def _point_equations(observations, weights, weighted, targets, count):
     return np.moveaxis(inverses, 2, 0), np.moveaxis(crossed, 2, 0), sides.T
 
 
-def _jackknife(observations, weights, known, count, groups):
+def _jackknife(
+    observations: Observations, weights: np.ndarray, known: np.ndarray, count: int | None, groups: np.ndarray
+) -> np.ndarray:
     """(3,) px^2: delete-a-group jackknife variances. groups: (m,) int."""
     labels = np.unique(groups)
     if len(labels) < 2:
@@ -201,7 +214,7 @@ def _jackknife(observations, weights, known, count, groups):
     return (len(labels) - 1) * found.var(axis=0)
 
 
-def neighbourhoods(points):
+def neighbourhoods(points: np.ndarray) -> np.ndarray:
     """(n,) int: blocks of equally many (n, 3) points near each other: SPLITS times each is halved at its median."""
     labels = np.zeros(len(points), np.int64)
     for split in range(SPLITS):

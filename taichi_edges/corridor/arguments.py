@@ -3,7 +3,9 @@
 import argparse
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 import taichi_edges
 from taichi_edges.corridor.stages import STAGES
@@ -13,12 +15,12 @@ from taichi_edges.errors import UserError
 class OneLineParser(argparse.ArgumentParser):
     """Says what is wrong with the command line in one line, without the usage before it."""
 
-    def error(self, message):
+    def error(self, message: str) -> NoReturn:
         """Exit with status 2."""
         self.exit(2, f"error: {message}; see {self.prog} --help\n")
 
 
-def parse_arguments(arguments=None):
+def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """The options of the command line; None for that of this process."""
     parser = OneLineParser(
         prog="python -m taichi_edges" if Path(sys.argv[0]).name == "__main__.py" else None,
@@ -44,7 +46,7 @@ def parse_arguments(arguments=None):
     return parser.parse_args(arguments)
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run from the command line. Returns the exit status: 0, or 2 for a mistake the user can put right."""
     options = parse_arguments(arguments)
     if hasattr(sys.stdout, "reconfigure"):

@@ -1,14 +1,19 @@
 """The stage `cluster`: from Gaussians to oriented points, each with the edge that it lies on."""
 
+from collections.abc import Mapping
 from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from taichi_edges.errors import UserError
 from taichi_edges.views.views import pixel_size, read_views
 
+if TYPE_CHECKING:
+    from taichi_edges.corridor.pipeline import Run
 
-def cluster(run):
+
+def cluster(run: "Run") -> dict[str, Any]:
     """`gaussians.ply`, `views.npz` -> `points.ply` (filtered oriented points, input frame) and `clusters.npz`."""
     from taichi_edges.exporters.point_cloud import write_oriented_points
     from taichi_edges.files.splats import read_gaussians
@@ -40,10 +45,10 @@ def cluster(run):
     labels = clusters.labels
     write_oriented_points(run.path("points.ply"), views.similarity.to_input(points), directions, labels)
     write_clusters(run.path("clusters.npz"), clusters)
-    found = {"points": len(points), "clusters": int(labels.max() + 1), "unclustered": int((labels < 0).sum())}
-    return {**asdict(counts), **found, "contours": contours}
+    numbers = {"points": len(points), "clusters": int(labels.max() + 1), "unclustered": int((labels < 0).sum())}
+    return {**asdict(counts), **numbers, "contours": contours}
 
 
-def _in_words(counts):
+def _in_words(counts: Mapping[str, int]) -> str:
     """'5 low opacity, 3 outliers' from a dict of counts, without those that are zero and the number of all."""
     return ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in counts.items() if n and name != "gaussians")

@@ -1,14 +1,19 @@
 """What the command does with its options: run the corridor, print the summary, show the window."""
 
 import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
-from taichi_edges.corridor.pipeline import run_stages
+from taichi_edges.corridor.pipeline import Run, run_stages
 from taichi_edges.corridor.reconstruction import open_run, stages_until
 from taichi_edges.corridor.stages import STAGES
 from taichi_edges.errors import UserError
 
+if TYPE_CHECKING:
+    from argparse import Namespace
 
-def run_command(options):
+
+def run_command(options: "Namespace") -> None:
     """Run what the parsed command line `options` asks for; mistakes of the user raise UserError."""
     if options.show:
         _refuse_vain_show(options.until)
@@ -20,7 +25,7 @@ def run_command(options):
         show(run)
 
 
-def _refuse_vain_show(until):
+def _refuse_vain_show(until: str | None) -> None:
     """UserError where --show cannot show anything in the end."""
     from taichi_edges.exporters.viewer import has_display
 
@@ -31,7 +36,7 @@ def _refuse_vain_show(until):
         raise UserError(f"{problem}; run without it and open edges.ply, edges.step or overlays.png")
 
 
-def print_summary(run, record, until=None):
+def print_summary(run: Run, record: dict[str, Any], until: str | None = None) -> None:
     """The metrics and the time of every stage, as two tables (plain lines where the output is not a terminal)."""
     done, rows = stages_until(record, until), []
     for name in done:
@@ -49,7 +54,7 @@ def print_summary(run, record, until=None):
     print(f"results: {run.folder}/" + (f"  ({files})" if files else ""))
 
 
-def result_files(stages, done):
+def result_files(stages: dict[str, Any], done: Sequence[str]) -> list[str]:
     """What to open of the stages that are done: the edges as far as they have come, and what shows them."""
     edges = [name for stage, name in (("fit", "edges_fit.json"), ("refine", "edges.json")) if stage in done][-1:]
     exported = stages["export"]["facts"]["files"] if "export" in done else []
@@ -57,7 +62,7 @@ def result_files(stages, done):
     return [name for name in (*edges, *exported, *prepared) if "/" not in name]
 
 
-def _print_table(title, headings, rows):
+def _print_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     if not sys.stdout.isatty():
         print(title)
         widths = [max(len(row[column]) for row in rows) for column in range(len(headings))] if rows else []
@@ -75,7 +80,7 @@ def _print_table(title, headings, rows):
     Console(highlight=False).print(table)
 
 
-def show(run):
+def show(run: Run) -> None:
     """An Open3D window of the oriented points and the edges."""
     from taichi_edges.exporters.point_cloud import read_oriented_points
     from taichi_edges.exporters.viewer import show as show_window

@@ -1,6 +1,8 @@
 """The stage `evaluate`: the edges against the ground truth where there is one, and against held-out views."""
 
+from collections.abc import Mapping
 from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -10,12 +12,17 @@ from taichi_edges.errors import UserError
 from taichi_edges.files.artefacts import write_csv, write_json
 from taichi_edges.geometry.edge_set import read_edges
 from taichi_edges.views.cameras import transform
-from taichi_edges.views.views import read_views
+from taichi_edges.views.views import Views, read_views
+
+if TYPE_CHECKING:
+    from taichi_edges.corridor.pipeline import Run
+    from taichi_edges.evaluation.ground_truth import GroundTruth
+    from taichi_edges.progress import Progress
 
 HARDLY_BETTER = 1.5  # times chance: right cameras give three times as much and more
 
 
-def evaluate(run):
+def evaluate(run: "Run") -> dict[str, Any]:
     """`edges.json` -> `metrics.json` and `metrics.csv`: EMAP's protocol, corners, free ends; without a truth fewer.
 
     And what the held-out views say. Lengths are in the frame of the truth, in the unit cube where there is none. With a
@@ -29,20 +36,20 @@ def evaluate(run):
     views, held_out = read_views(run.path("views.npz")), read_views(run.path("held_out.npz"))
     unit, truth = edges.transformed(views.similarity.to_unit), _ground_truth(run, views, held_out)
     if truth is None:
-        metrics = measure_alone(unit)
+        scores = measure_alone(unit)
     else:
-        metrics = measure(
+        scores = measure(
             edges.transformed(partial(transform, views.input_to_truth)) if truth.own_frame else unit, truth
         )
-    metrics |= held_out_metrics(exact_polylines(unit), views, held_out)
-    _warn_of_chance(metrics, run.progress)
-    metrics["ground_truth"] = truth and truth.source
+    scores |= held_out_metrics(exact_polylines(unit), views, held_out)
+    _warn_of_chance(scores, run.progress)
+    metrics = {**scores, "ground_truth": None if truth is None else truth.source}
     write_json(run.path("metrics.json"), metrics)
     write_csv(run.path("metrics.csv"), [("metric", "value"), *metrics.items()])
     return {**metrics, "files": _write_pseudo_truth(run, views, truth)}
 
 
-def _warn_of_chance(metrics, progress):
+def _warn_of_chance(metrics: Mapping[str, float | None], progress: "Progress") -> None:
     """Say so where the edges are hardly better in the held-out views than edges displaced at random would be."""
     found, chance = (metrics.get(f"held_out_{name}_percent") for name in ("precision", "chance"))
     if found is not None and chance is not None and found < HARDLY_BETTER * chance:
@@ -50,14 +57,14 @@ def _warn_of_chance(metrics, progress):
         progress.warn(f"{problem}: {WRONG_CAMERAS}")
 
 
-def _ground_truth(run, views, held_out):
+def _ground_truth(run: "Run", views: Views, held_out: Views) -> "GroundTruth | None":
     """The GroundTruth of the scene, or None. views, held_out: Views that found its edges, and the others."""
     from taichi_edges.evaluation.ground_truth import read_ground_truth, read_sampled_ply
     from taichi_edges.evaluation.pseudo_truth import Votes, points_in_box, pseudo_truth
 
     path, config, from_truth = truth_path(run), run.config.evaluation, np.linalg.inv(views.input_to_truth)
 
-    def to_unit(points):
+    def to_unit(points: np.ndarray) -> np.ndarray:
         return views.similarity.to_unit(transform(from_truth, points))
 
     if path is None or config.kind != "scan":
@@ -70,7 +77,7 @@ def _ground_truth(run, views, held_out):
     return pseudo_truth(points, votes, config.scan, str(path))
 
 
-def _scan_maps(run, views, held_out):
+def _scan_maps(run: "Run", views: Views, held_out: Views) -> dict[str, np.ndarray]:
     """{name of a view: (H, W) uint8 edge map} that a scan's points are projected on."""
     folder, source = run.config.evaluation.scan.edges, run.config.source
     names = [*views.names, *held_out.names]
@@ -85,8 +92,9 @@ def _scan_maps(run, views, held_out):
     frames, made = chosen_frames(listed_frames(run, edges=folder), source.skip), run.path("undistorted_for_scan")
     frames = posed_frames(run, frames, edges=folder)
     frames = subset(frames, [frames.names.index(name) for name in names])  # prepare may have left some views out
-    options = {"threads": run.threads, "progress": run.progress, "kinds": ("edge_paths",)}
-    frames = undistorted_frames(frames, made, source.max_size, source.gamma, **options)
+    frames = undistorted_frames(
+        frames, made, source.max_size, source.gamma, run.threads, run.progress, kinds=("edge_paths",)
+    )
     maps = dict(zip(frames.names, read_edge_maps(frames, run.progress, run.threads), strict=True))
     if next(iter(maps.values())).shape != views.edge_maps.shape[1:]:
         problem = f"its maps are not {views.width} x {views.height} px as the scene's views are"
@@ -94,10 +102,10 @@ def _scan_maps(run, views, held_out):
     return {name: maps[name] for name in names}
 
 
-def _write_pseudo_truth(run, views, truth):
+def _write_pseudo_truth(run: "Run", views: Views, truth: "GroundTruth | None") -> list[str]:
     """The names of the files written: the points of the GroundTruth, if they are those of a scan on edges."""
     path = run.path("pseudo_truth.ply")
-    if run.config.evaluation.kind != "scan":
+    if truth is None or run.config.evaluation.kind != "scan":
         path.unlink(missing_ok=True)  # of an older run with other settings
         return []
     from taichi_edges.files.ply import write_float_vertices

@@ -1,11 +1,16 @@
 """The stage `export`: files for other programs, and pictures."""
 
+from typing import TYPE_CHECKING, Any
+
 from taichi_edges.corridor.edgels_of_views import with_whole_paths
 from taichi_edges.geometry.wireframe import read_wireframe
 from taichi_edges.views.views import read_views
 
+if TYPE_CHECKING:
+    from taichi_edges.corridor.pipeline import Run
 
-def export(run):
+
+def export(run: "Run") -> dict[str, Any]:
     """`edges.json`, `views.npz` -> `edges.ply`, `.obj`, `.dxf`, `.step`, pictures in `overlays/`, `overlays.png`."""
     from taichi_edges.exporters import EXPORTERS
     from taichi_edges.exporters.overlays import contact_sheet, draw_overlays

@@ -1,17 +1,20 @@
 """What each stage has found, in one line for the person who waits. `FINDINGS[stage](facts)` makes it."""
 
+from collections.abc import Mapping
+from typing import Any
+
 from taichi_edges.errors import amount
 
 WRONG_CAMERAS = "poses or intrinsics may not be those of these images (their order, axes or scale)"
 
 
-def left_out(*amounts):
+def left_out(*amounts: tuple[int, str] | tuple[int, str, str]) -> str:
     """'; left out: 3 outliers, 1 point': the (count, noun, plural) that are not zero, '' where all are."""
     named = [amount(*each) for each in amounts if each[0]]
     return f"; left out: {', '.join(named)}" if named else ""
 
 
-def describe_prepare(facts):
+def describe_prepare(facts: Mapping[str, Any]) -> str:
     """'9 views and 1 held out, 128 x 128 px, 9000 edgels, lines 2.4 px wide; maps shifted by (-0.55, -0.7) px: ...'."""
     part = f" of the synthetic part '{facts['part']}'" if "part" in facts else ""
     size = f"{facts['width_px']} x {facts['height_px']} px"
@@ -21,7 +24,7 @@ def describe_prepare(facts):
     return f"{found}{describe_calibration(facts.get('calibration'))}"
 
 
-def describe_calibration(facts):
+def describe_calibration(facts: Mapping[str, Any] | None) -> str:
     """'; maps shifted by (-0.55, -0.71) px: corrected; silhouettes 1.32 px outside: corrected', '' without facts."""
     if facts is None:
         return ""
@@ -36,13 +39,13 @@ def describe_calibration(facts):
     return "".join(f"; {what}: {'corrected' if applied else 'left as it is'}" for what, applied in found) + unknown
 
 
-def describe_train(facts):
+def describe_train(facts: Mapping[str, Any]) -> str:
     """'875 Gaussians after 720 view steps, final loss 0.1398'."""
     loss = "" if facts["final_loss"] is None else f", final loss {facts['final_loss']:.4f}"
     return f"{amount(facts['gaussians'], 'Gaussian')} after {amount(facts['view_steps'], 'view step')}{loss}"
 
 
-def describe_cluster(facts):
+def describe_cluster(facts: Mapping[str, Any]) -> str:
     """'823 points on 40 edges (500 grown, 20 harvested); left out: 40 Gaussians of low opacity, ..., 2 contours'."""
     found = f"{amount(facts['points'] - facts['unclustered'], 'point')} on {amount(facts['clusters'], 'edge')}"
     more = [f"{facts[kind]} {kind}" for kind in ("grown", "harvested") if facts[kind]]
@@ -60,7 +63,7 @@ def describe_cluster(facts):
     )
 
 
-def describe_fit(facts):
+def describe_fit(facts: Mapping[str, Any]) -> str:
     """'19 lines and 21 curves (2 of the edges closed); left out: 3 clusters that are too short'."""
     closed = facts["loop_clusters"]
     loops = f" ({closed} closed {'edge' if closed == 1 else 'edges'})" if closed else ""
@@ -70,10 +73,10 @@ def describe_fit(facts):
     )
 
 
-def describe_refine(facts):
+def describe_refine(facts: Mapping[str, Any]) -> str:
     """'33 edges, 20 vertices; 2 strokes joined to others; 71 parallel (refine.regularise: true makes them exact)'."""
     found = f"{amount(facts['edges'], 'edge')}, {amount(facts['vertices'], 'vertex', 'vertices')}"
-    done = [
+    done: list[tuple[int, str] | tuple[int, str, str]] = [
         (facts["joined"], "stroke joined to others", "strokes joined to others"),
         (facts["circles"], "circle completed", "circles completed"),
         (facts["anchored"], "line hung up on others", "lines hung up on others"),
@@ -91,7 +94,7 @@ def describe_refine(facts):
     )
 
 
-def describe_relations(relations):
+def describe_relations(relations: Mapping[str, tuple[int, int]]) -> str:
     """'; 71 parallel, 3 coaxial (refine.regularise: true makes them exact)', '' where there are none."""
     named = [f"{found} {kind.replace('_', ' ')}" for kind, (found, _) in relations.items() if found]
     if not named:
@@ -101,7 +104,7 @@ def describe_relations(relations):
     return f"; {', '.join(named)} ({state})"
 
 
-def describe_evaluate(facts):
+def describe_evaluate(facts: Mapping[str, Any]) -> str:
     """'F-score 72.6 % at 5 mm, ..., 74.6 % at 20 mm; 7 of 8 corners closed; 3 views held out: ...'; '2 edges, ...'."""
     if facts["ground_truth"] is None:
         length, ends = f"{facts['predicted_length_units']:.2f} units long", amount(facts["free_ends"], "free end")
@@ -111,7 +114,7 @@ def describe_evaluate(facts):
     return f"F-score {', '.join(shares)}{corners}{describe_held_out(facts)}"
 
 
-def describe_held_out(facts):
+def describe_held_out(facts: Mapping[str, Any]) -> str:
     """'; 3 views held out: precision 93.1 %, recall 62.4 % of long edges', '' where none were."""
     precision, recall = (facts.get(f"held_out_{share}_percent") for share in ("precision", "recall_long"))
     shares = [f"precision {precision:.1f} %"] if precision is not None else []
@@ -119,7 +122,7 @@ def describe_held_out(facts):
     return f"; {amount(facts['held_out_views'], 'view')} held out: {', '.join(shares)}" if shares else ""
 
 
-def describe_export(facts):
+def describe_export(facts: Mapping[str, Any]) -> str:
     """'edges.ply, edges.dxf, overlays.png and 4 pictures in overlays/'."""
     files = [name for name in facts["files"] if "/" not in name]
     return f"{', '.join(files)} and {amount(len(facts['files']) - len(files), 'picture')} in overlays/"

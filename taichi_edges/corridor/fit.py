@@ -1,10 +1,15 @@
 """The stage `fit`: a shape for each cluster of points."""
 
+from typing import TYPE_CHECKING, Any
+
 from taichi_edges.geometry.wireframe import write_wireframe
 from taichi_edges.views.views import read_views
 
+if TYPE_CHECKING:
+    from taichi_edges.corridor.pipeline import Run
 
-def fit(run):
+
+def fit(run: "Run") -> dict[str, Any]:
     """`clusters.npz` -> `edges_fit.json` (input frame): edges that do not meet yet."""
     from taichi_edges.strokes.assembly import fit_clusters
     from taichi_edges.strokes.clusters import read_clusters

@@ -10,18 +10,18 @@ MIB = 1024.0 * 1024.0
 PROCESS = Path("/proc/self")  # of Linux
 
 
-def available_threads():
+def available_threads() -> int:
     """Threads that this process may use, where the system tells; else all there are."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def reset_peak_memory():
+def reset_peak_memory() -> None:
     """Start the peak anew, on Linux."""
     with contextlib.suppress(OSError):
         (PROCESS / "clear_refs").write_text("5", encoding="ascii")
 
 
-def peak_memory_mib():
+def peak_memory_mib() -> float:
     """Peak resident memory of this process, MiB.
 
     On Linux since its start or the last `reset_peak_memory`, on Windows since its start. macOS does not tell: there it

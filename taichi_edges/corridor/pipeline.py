@@ -17,17 +17,19 @@ import functools
 import os
 import platform
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 import taichi_edges
 from taichi_edges.corridor.findings import FINDINGS
 from taichi_edges.corridor.machine import available_threads, peak_memory_mib, reset_peak_memory
-from taichi_edges.corridor.stages import STAGES, function_of
+from taichi_edges.corridor.stages import STAGES, Stage, function_of
 from taichi_edges.errors import UserError, refuse_unknown
 from taichi_edges.files.artefacts import (
     digest,
@@ -65,7 +67,15 @@ class Run:
     arch: str
     progress: Progress
 
-    def __init__(self, config, folder, data_root=None, threads=None, arch="cpu", progress=None):
+    def __init__(
+        self,
+        config: SceneConfig,
+        folder: Path | str,
+        data_root: Path | str | None = None,
+        threads: int | None = None,
+        arch: str = "cpu",
+        progress: Progress | None = None,
+    ) -> None:
         """Paths may be strings. data_root: None for that of TAICHI_EDGES_DATA, where it is set. threads: None for all
         that this process may use. progress: None for what the command shows; a plain Progress() is silent.
         """
@@ -83,17 +93,17 @@ class Run:
             progress=progress or make_progress(),
         )
 
-    def path(self, name):
+    def path(self, name: str) -> Path:
         """An artefact's path."""
         return self.folder / name
 
     @property
-    def kernel_cache(self):
+    def kernel_cache(self) -> Path:
         """Where compiled Taichi kernels are kept between runs: a folder of our own for each pair of versions."""
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         return home / "taichi_edges" / f"kernels-{taichi_edges.__version__}-taichi-{version('taichi')}"
 
-    def data_path(self, text, key):
+    def data_path(self, text: Path | str, key: str) -> Path:
         """A path of the scene: absolute, or relative to the data root. UserError where it does not exist."""
         path = expand(text, key)
         if not path.is_absolute():
@@ -106,7 +116,7 @@ class Run:
         return path
 
 
-def with_reader(run):
+def with_reader(run: Run) -> Run:
     """The run with the reader that fits what is at its source.path, where the scene names none; says which it is."""
     if run.config.source.reader != "auto":
         return run
@@ -118,7 +128,7 @@ def with_reader(run):
     return replace(run, config=run.config.model_copy(update={"source": source}))
 
 
-def run_stages(run, start=None, until=None):
+def run_stages(run: Run, start: str | None = None, until: str | None = None) -> dict[str, Any]:
     """Run the corridor. start: this stage and those after it run anew; until: stop after this one.
 
     Without `start`, every stage that is up to date is skipped. Returns the record that `run.json` holds; its key "ran"
@@ -144,7 +154,7 @@ def run_stages(run, start=None, until=None):
 
 
 @contextlib.contextmanager
-def _own_folder(run):
+def _own_folder(run: Run) -> Iterator[None]:
     """The run's folder, ours alone; UserError where it cannot be."""
     with contextlib.ExitStack() as stack:
         with _explained_to_be_unwritable(run):
@@ -153,7 +163,7 @@ def _own_folder(run):
 
 
 @contextlib.contextmanager
-def _explained_to_be_unwritable(run):
+def _explained_to_be_unwritable(run: Run) -> Iterator[None]:
     try:
         yield
     except OSError as error:
@@ -161,7 +171,7 @@ def _explained_to_be_unwritable(run):
         raise UserError(f"{run.folder}: {problem}; choose another folder with --out") from error
 
 
-def _open_record(run):
+def _open_record(run: Run) -> dict[str, Any]:
     """The run's record, with what is known before any stage: the resolved scene, versions, machine."""
     scene = run.config.model_dump()
     with _explained_to_be_unwritable(run):
@@ -184,7 +194,7 @@ def _open_record(run):
 
 
 @functools.cache
-def _versions(more=()):
+def _versions(more: tuple[str, ...] = ()) -> dict[str, str]:
     """The versions of ourselves, of PACKAGES and of more, by name; without those that are not installed."""
     found = {"taichi_edges": taichi_edges.__version__}
     for package in (*PACKAGES, *more):
@@ -193,11 +203,11 @@ def _versions(more=()):
     return found
 
 
-def _settings(run, stage):
+def _settings(run: Run, stage: Stage) -> dict[str, Any]:
     """The values a stage depends on, by key."""
-    values = {}
+    values: dict[str, Any] = {}
     for section in stage.sections:
-        value = run.config
+        value: Any = run.config
         for name in section.split("."):
             value = getattr(value, name)
         values[section] = value.model_dump() if hasattr(value, "model_dump") else value
@@ -206,19 +216,19 @@ def _settings(run, stage):
     return values
 
 
-def _inputs(run, stage):
+def _inputs(run: Run, stage: Stage) -> dict[str, Any]:
     """What the stage depends on: its settings, the versions, and the digest of every file it reads."""
     files = {artefact: digest_file(run.path(artefact)) for artefact in stage.reads}
     files |= {_label(run, path): digest_file(path) for path in stage.outside(run) if path.exists()}
     return {"settings": _settings(run, stage), "files": files, "versions": _versions(stage.packages)}
 
 
-def _label(run, path):
+def _label(run: Run, path: Path) -> str:
     """A file's path, relative to the run's folder where it lies in it: a folder that was moved is not stale."""
     return str(path.relative_to(run.folder)) if path.is_relative_to(run.folder) else str(path)
 
 
-def _why_stale(run, record, name):
+def _why_stale(run: Run, record: dict[str, Any], name: str) -> tuple[str, str] | None:
     """None where a stage is up to date, else (artefact, why it is not what the stage would write now)."""
     stage, known = STAGES[name], record["stages"].get(name)
     missing = [artefact for artefact in stage.writes if not run.path(artefact).exists()]
@@ -240,7 +250,7 @@ def _why_stale(run, record, name):
     return None
 
 
-def _refuse_stale(run, record, name):
+def _refuse_stale(run: Run, record: dict[str, Any], name: str) -> None:
     """UserError unless the stage, one before those asked for, is up to date."""
     stale = _why_stale(run, record, name)
     if stale:
@@ -248,7 +258,7 @@ def _refuse_stale(run, record, name):
         raise UserError(f"{run.path(artefact)}: {why}; run again without --stage, or with --stage {name}")
 
 
-def _changes(old, new):
+def _changes(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     """What differs between two `_inputs`: 'train.epochs was 500, is now 100', 'views.npz has changed'."""
     changes = _changed_values(old.get("settings", {}), new["settings"])
     before, now = old.get("files", {}), new["files"]
@@ -259,7 +269,7 @@ def _changes(old, new):
     return changes + _changed_values(old.get("versions", {}), new["versions"], "the version of ")
 
 
-def _changed_values(old, new, prefix=""):
+def _changed_values(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> list[str]:
     """'train.epochs was 500, is now 100' for every value that differs between two nested dicts."""
     found = []
     for key in [*new, *(key for key in old if key not in new)]:
@@ -273,7 +283,7 @@ def _changed_values(old, new, prefix=""):
     return found
 
 
-def _run_stage(run, record, name, force):
+def _run_stage(run: Run, record: dict[str, Any], name: str, force: bool) -> None:
     """Run one stage, or skip it where it is up to date; keep the record on disk."""
     stage, known = STAGES[name], record["stages"].get(name)
     stale = _why_stale(run, record, name)

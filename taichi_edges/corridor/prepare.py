@@ -3,6 +3,7 @@
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,11 +12,19 @@ from taichi_edges.corridor.sources import listed_frames, posed_frames
 from taichi_edges.errors import UserError, amount, did_you_mean
 from taichi_edges.files.artefacts import replacing
 from taichi_edges.geometry.edge_set import write_edges
+from taichi_edges.views.views import Views
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from taichi_edges.corridor.pipeline import Run
+    from taichi_edges.progress import Progress
+    from taichi_edges.readers.frames import Frames
 
 UNIT_CUBE = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 
 
-def prepare(run):
+def prepare(run: "Run") -> dict[str, Any]:
     """Source -> `views.npz`, `held_out.npz` (views for the evaluation alone) and `detection.png`.
 
     Of synthetic scenes also `truth.json` and pictures in `images/`.
@@ -43,7 +52,7 @@ def prepare(run):
     return {**facts, "files": [*own, *facts["files"], *_write_points(run, frames, box)]}
 
 
-def _pass_on(frames, progress):
+def _pass_on(frames: "Frames", progress: "Progress") -> None:
     """Tell the user what the reader has to say."""
     for note in frames.notes:
         progress.say(note)
@@ -51,7 +60,7 @@ def _pass_on(frames, progress):
         progress.warn(warning)
 
 
-def _scene_box(run, frames):
+def _scene_box(run: "Run", frames: "Frames") -> "tuple[ArrayLike, str]":
     """(2, 3) corners of the scene, input units, and where they are from."""
     if run.config.box != "auto":
         return run.config.box, "scene"
@@ -67,7 +76,7 @@ def _scene_box(run, frames):
     return UNIT_CUBE, "unit cube"
 
 
-def _checked(run, frames, box, guessed):
+def _checked(run: "Run", frames: "Frames", box: "ArrayLike", guessed: bool) -> "Frames":
     """The frames, whose cameras and box can be those of one scene; without those that do not see a guessed box."""
     from taichi_edges.readers.frames import check_before_detection, frames_in_sight
     from taichi_edges.readers.images import refuse_copies
@@ -80,7 +89,7 @@ def _checked(run, frames, box, guessed):
     return frames
 
 
-def _undistorted(run, frames):
+def _undistorted(run: "Run", frames: "Frames") -> "Frames":
     """The frames as pinhole cameras would have taken them, their pictures in the run's folder."""
     from taichi_edges.readers.undistortion import undistorted_frames
 
@@ -88,29 +97,30 @@ def _undistorted(run, frames):
     return undistorted_frames(frames, folder, source.max_size, source.gamma, run.threads, run.progress)
 
 
-def _refuse_missing_points(run, frames):
+def _refuse_missing_points(run: "Run", frames: "Frames") -> None:
     """UserError where the training is to start from points and there are none."""
-    if run.config.train.seeds == "points" and not run.config.source.points and not _has_points(frames):
+    if run.config.train.seeds == "points" and not run.config.source.points and not len(_points_of(frames)):
         problem = "train.seeds is 'points', but the model has none that fit"
         raise UserError(f"{frames.where}: {problem}; set source.points or another train.seeds")
 
 
-def _has_points(frames):
-    return frames.points is not None and len(frames.points) > 0
+def _points_of(frames: "Frames | None") -> np.ndarray:
+    """(n, 3) points that the layout has, input units; none without frames."""
+    return np.zeros((0, 3)) if frames is None or frames.points is None else frames.points
 
 
-def _inside_the_run(run, views):
+def _inside_the_run(run: "Run", views: Views) -> Views:
     """The views with paths relative to the run's folder for pictures in it: it may be moved."""
     folder = str(run.folder)
     paths = (os.path.relpath(path, folder) if path and _lies_in(path, folder) else path for path in views.image_paths)
     return replace(views, image_paths=tuple(paths))
 
 
-def _lies_in(path, folder):
+def _lies_in(path: str, folder: str) -> bool:
     return Path(os.path.abspath(path)).is_relative_to(os.path.abspath(folder))
 
 
-def _refuse_needless_calibration(run, detector):
+def _refuse_needless_calibration(run: "Run", detector: str) -> None:
     """UserError where the scene gives biases of maps, and there are no maps."""
     wanted = run.config.calibration
     if detector == "subpixel" and not (isinstance(wanted.shift, str) and isinstance(wanted.silhouette, str)):
@@ -118,19 +128,19 @@ def _refuse_needless_calibration(run, detector):
         raise UserError(f"{problem}; leave it out, or name ready maps in source.edges")
 
 
-def _detected_in_pictures(run, views):
+def _detected_in_pictures(run: "Run", views: Views) -> Views:
     """The views with what a detector finds in their own pictures in place of the maps that came with them."""
     from taichi_edges.detectors import DETECTORS
     from taichi_edges.readers.frames import Frames
 
     paths = with_whole_paths(run, views).image_paths
-    cameras = list(views.intrinsics), list(views.world_to_camera)
-    frames = Frames(run.path("images"), list(views.names), [""] * len(views), list(paths), *cameras, opengl=False)
+    nothing = [None] * len(views)  # is known of the cameras here, nor needed
+    frames = Frames(run.path("images"), views.names, [""] * len(views), paths, nothing, nothing, opengl=False)
     _, edge_maps, edgels = DETECTORS[run.config.source.detector](frames, run)
     return replace(views, edge_maps=edge_maps, edgels=edgels)
 
 
-def _write_points(run, frames, box):
+def _write_points(run: "Run", frames: "Frames | None", box: "ArrayLike") -> list[str]:
     """The points the scene or the layout has, those inside the box, to `seeds.ply`. Returns the files written.
 
     box: (2, 3) corners, input units.
@@ -141,7 +151,7 @@ def _write_points(run, frames, box):
     if run.config.source.points:
         points = read_points(run.data_path(run.config.source.points, "source.points"), box)
     else:
-        points = inside_box(frames.points, box) if frames is not None and _has_points(frames) else []
+        points = inside_box(_points_of(frames), box)
     if len(points) == 0:
         run.path("seeds.ply").unlink(missing_ok=True)  # of an older run with other settings
         return []
@@ -149,7 +159,7 @@ def _write_points(run, frames, box):
     return ["seeds.ply"]
 
 
-def _prepare_synthetic(run):
+def _prepare_synthetic(run: "Run") -> dict[str, Any]:
     """Render the embedded part; every random choice follows the scene's seed."""
     import cv2
 
@@ -170,7 +180,7 @@ def _prepare_synthetic(run):
         stale.unlink()
     for file, picture in zip(files, pictures, strict=True):
         with replacing(run.path(file)) as unfinished:
-            unfinished.write_bytes(cv2.imencode(".png", picture[:, :, ::-1])[1])
+            unfinished.write_bytes(cv2.imencode(".png", picture[:, :, ::-1])[1].tobytes())
     views = replace(views, image_paths=tuple(files))
     if source.detector in ("subpixel", "onnx"):
         views = _detected_in_pictures(run, views)

@@ -1,7 +1,9 @@
 """From a scene to its wireframe in one call: what the command does, and `reconstruct` for other programs."""
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from taichi_edges.corridor.pipeline import Run, run_stages, with_reader
 from taichi_edges.corridor.stages import STAGES
@@ -24,30 +26,30 @@ class Reconstruction:
 
     run: Run
     wireframe: Wireframe | None
-    metrics: dict | None
-    record: dict
+    metrics: dict[str, Any] | None
+    record: dict[str, Any]
 
     @property
-    def folder(self):
+    def folder(self) -> Path:
         """Where all files of the run are."""
         return self.run.folder
 
 
 def reconstruct(
-    scene,
-    start=None,
-    until=None,
+    scene: Path | str,
+    start: str | None = None,
+    until: str | None = None,
     *,
-    out="runs",
-    data=None,
-    preset=None,
-    scale=None,
-    seed=None,
-    threads=None,
-    arch="cpu",
-    quiet=False,
-    **settings,
-):
+    out: Path | str = "runs",
+    data: Path | str | None = None,
+    preset: str | None = None,
+    scale: str | None = None,
+    seed: int | None = None,
+    threads: int | None = None,
+    arch: str = "cpu",
+    quiet: bool = False,
+    **settings: Any,
+) -> Reconstruction:
     """Recover the 3D edges of a scene; what is up to date in its folder, `out`/<name of the scene>, is kept.
 
     scene: a scene file, the name of one that comes along ("demo"), or a folder: COLMAP, nerfstudio, photographs, ...
@@ -56,7 +58,7 @@ def reconstruct(
     settings: keys of the scene and its sections, as a scene file has them: `name="mine", train={"steps": 300}`.
     Returns a Reconstruction. UserError where the input has a mistake.
     """
-    options = {"out": out, "data": data, "preset": preset, "scale": scale, "seed": seed}
+    options: dict[str, Any] = {"out": out, "data": data, "preset": preset, "scale": scale, "seed": seed}
     run = open_run(scene, settings, **options, threads=threads, arch=arch, quiet=quiet)
     record = run_stages(run, start, until)
     done = stages_until(record, until)
@@ -65,7 +67,19 @@ def reconstruct(
     return Reconstruction(run, wireframe, metrics, record)
 
 
-def open_run(scene, settings, *, out, data, preset, scale, seed, threads, arch, quiet):
+def open_run(
+    scene: Path | str,
+    settings: Iterable[str] | Mapping[str, Any],
+    *,
+    out: Path | str,
+    data: Path | str | None,
+    preset: str | None,
+    scale: str | None,
+    seed: int | None,
+    threads: int | None,
+    arch: str,
+    quiet: bool,
+) -> Run:
     """The Run of a scene, ready for `run_stages`. settings: as `load_scene` takes them, the rest as `reconstruct`."""
     data = data_folder(data)
     config = load_scene(scene, preset, settings, seed, scale, data)
@@ -76,13 +90,13 @@ def open_run(scene, settings, *, out, data, preset, scale, seed, threads, arch, 
     return run
 
 
-def stages_until(record, until=None):
+def stages_until(record: Mapping[str, Any], until: str | None = None) -> list[str]:
     """The names of the stages that a run has behind it which was to end with `until`, None for the last."""
     names = list(STAGES)
     return [name for name in names[: names.index(until) + 1 if until else None] if name in record["stages"]]
 
 
-def _refuse_results_of_another(run):
+def _refuse_results_of_another(run: Run) -> None:
     """UserError where the run's folder holds the results of another source: folders in two places may be called alike.
 
     Only where the name is the folder's; in a scene file the user has chosen it.

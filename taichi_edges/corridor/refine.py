@@ -1,13 +1,17 @@
 """The stage `refine`: edges that meet, in agreement with the edgels of all views."""
 
 from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
 from taichi_edges.errors import amount
 from taichi_edges.geometry.wireframe import read_wireframe, write_wireframe
 from taichi_edges.views.views import read_views
 
+if TYPE_CHECKING:
+    from taichi_edges.corridor.pipeline import Run
 
-def refine(run):
+
+def refine(run: "Run") -> dict[str, Any]:
     """`edges_fit.json`, `views.npz` -> `edges.json` (input frame): edges that meet, and what the images say of each."""
     from taichi_edges.kernels.device import is_running, start_taichi
     from taichi_edges.refinement.stage import refine_wireframe

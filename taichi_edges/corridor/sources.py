@@ -1,11 +1,16 @@
 """Which files a scene consists of: what its reader lists, and what each stage depends on."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from taichi_edges.errors import UserError
 
+if TYPE_CHECKING:
+    from taichi_edges.corridor.pipeline import Run
+    from taichi_edges.readers.frames import Frames
 
-def listed_frames(run, **changed):
+
+def listed_frames(run: "Run", **changed: str) -> "Frames":
     """What the reader found. changed: keys of the scene's source that are to be read otherwise."""
     from taichi_edges.readers import READERS
 
@@ -13,7 +18,7 @@ def listed_frames(run, **changed):
     return READERS[source.reader](run.data_path(source.path, "source.path"), source)
 
 
-def posed_frames(run, frames, **changed):
+def posed_frames(run: "Run", frames: "Frames", **changed: str) -> "Frames":
     """The frames themselves; photographs without poses after structure from motion. changed: see `listed_frames`."""
     source = run.config.source.model_copy(update=changed)
     if source.reader != "images":
@@ -24,7 +29,7 @@ def posed_frames(run, frames, **changed):
     return posed_photos(frames, folder, source, run.path("sfm"), run.config.seed, run.threads, run.progress)
 
 
-def source_files(run):
+def source_files(run: "Run") -> list[Path]:
     """Every file the prepare stage reads, so that a changed input is noticed."""
     source = run.config.source
     points = [run.data_path(source.points, "source.points")] if source.points else []
@@ -37,7 +42,7 @@ def source_files(run):
     return [*own, *sorted(path for path in paths if path.is_file()), *points, *models]
 
 
-def _model_file(run):
+def _model_file(run: "Run") -> Path:
     """The ONNX file the scene names."""
     path = run.data_path(run.config.source.onnx.model, "source.onnx.model")
     if not path.is_file():
@@ -45,19 +50,19 @@ def _model_file(run):
     return path
 
 
-def seed_files(run):
+def seed_files(run: "Run") -> list[Path]:
     """The points that training may start from, where the scene or the layout has some."""
     return [run.path("seeds.ply")]
 
 
-def truth_path(run):
+def truth_path(run: "Run") -> Path | None:
     """The ground truth of the scene, or None: what the scene names, or what the synthetic source wrote."""
     if run.config.evaluation.truth:
         return run.data_path(run.config.evaluation.truth, "evaluation.truth")
     return run.path("truth.json") if run.config.source.reader == "synthetic" else None
 
 
-def picture_files(run):
+def picture_files(run: "Run") -> list[Path]:
     """The colour images that the overlays are drawn on; those of a synthetic scene are its own."""
     source = run.config.source
     if source.reader == "synthetic":
@@ -65,7 +70,7 @@ def picture_files(run):
     return [Path(path) for path in listed_frames(run).image_paths if path and Path(path).is_file()]
 
 
-def truth_files(run):
+def truth_files(run: "Run") -> list[Path]:
     """Every file the ground truth consists of."""
     from taichi_edges.evaluation.ground_truth import refuse_unknown
 
@@ -74,11 +79,11 @@ def truth_files(run):
         return []
     if run.config.evaluation.truth:  # that of a synthetic scene may still have to be written
         refuse_unknown(path)
-    truth = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [Path(path)]
+    truth = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
     return truth + _scan_map_files(run)
 
 
-def _scan_map_files(run):
+def _scan_map_files(run: "Run") -> list[Path]:
     """The edge maps that the points of a scan are held against, where the scene names a folder of its own for them."""
     source, config = run.config.source, run.config.evaluation
     if config.kind != "scan" or not config.scan.edges or source.reader == "synthetic":

@@ -7,8 +7,13 @@ are to run.
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from taichi_edges.corridor import sources
+
+if TYPE_CHECKING:
+    from taichi_edges.corridor.pipeline import Run
 
 
 @dataclass(frozen=True)
@@ -21,12 +26,12 @@ class Stage:
     packages: those beyond PACKAGES whose version matters to it.
     """
 
-    sections: tuple
-    reads: tuple
-    writes: tuple
-    outside: Callable = lambda run: []
+    sections: tuple[str, ...]
+    reads: tuple[str, ...]
+    writes: tuple[str, ...]
+    outside: Callable[["Run"], list[Path]] = lambda run: []
     on_device: bool = False
-    packages: tuple = ()
+    packages: tuple[str, ...] = ()
 
 
 STAGES = {
@@ -68,6 +73,6 @@ STAGES = {
 }
 
 
-def function_of(name):
+def function_of(name: str) -> Callable[["Run"], dict[str, Any]]:
     """The function of a stage."""
     return getattr(import_module(f"taichi_edges.corridor.{name}"), name)

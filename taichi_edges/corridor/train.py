@@ -1,13 +1,19 @@
 """The stage `train`: Gaussians, optimised until they lie on edges."""
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from taichi_edges.corridor.findings import WRONG_CAMERAS
 from taichi_edges.files.artefacts import write_csv
-from taichi_edges.views.views import read_views
+from taichi_edges.views.views import Views, read_views
+
+if TYPE_CHECKING:
+    from taichi_edges.corridor.pipeline import Run
+    from taichi_edges.splatting.gaussians import Gaussians
 
 
-def train(run):
+def train(run: "Run") -> dict[str, Any]:
     """`views.npz` -> `gaussians.ply` (input frame) and `train_log.csv`."""
     from taichi_edges.files.splats import write_gaussians
     from taichi_edges.kernels.device import start_taichi
@@ -19,9 +25,8 @@ def train(run):
     start = start_of_training(run, views, generator)
     training = Training(views, config, generator, run.threads, run.arch)
     gaussians, records = training.run(start, run.progress)
-    rows = [("step", "seconds", "loss", "gaussians")]
-    rows += [(r.step, f"{r.seconds:.3f}", f"{r.loss:.6f}", r.gaussians) for r in records]
-    write_csv(run.path("train_log.csv"), rows)
+    rows = [(r.step, f"{r.seconds:.3f}", f"{r.loss:.6f}", r.gaussians) for r in records]
+    write_csv(run.path("train_log.csv"), [("step", "seconds", "loss", "gaussians"), *rows])
     similarity = views.similarity
     write_gaussians(
         run.path("gaussians.ply"),
@@ -34,14 +39,14 @@ def train(run):
     return {"gaussians": len(gaussians), "view_steps": records[-1].step, "final_loss": loss}
 
 
-def start_of_training(run, views, generator):
+def start_of_training(run: "Run", views: Views, generator: np.random.Generator) -> "Gaussians":
     """The Gaussians that training starts from, as `train.seeds` says."""
     from taichi_edges.files.ply import read_vertices, stack_fields
     from taichi_edges.seeding.starts import LEAST_VOTED, given_points, random_points, voted_gaussians
     from taichi_edges.splatting.gaussians import start_gaussians
 
     config = run.config.train
-    seeds = config.seeds
+    seeds: str = config.seeds
     if seeds in ("votes", "sweep"):
         found, seeds = _swept(run, views) if seeds == "sweep" else (None, seeds)
         if seeds == "votes":
@@ -50,8 +55,8 @@ def start_of_training(run, views, generator):
             return found
         seeds = "points" if run.path("seeds.ply").is_file() else "random"
         instead = {"points": "the given points", "random": "random points"}[seeds]
-        found = f"the views agree on an edge in fewer than {LEAST_VOTED} places"
-        run.progress.warn(f"{found}: {WRONG_CAMERAS}; the training starts from {instead} instead")
+        problem = f"the views agree on an edge in fewer than {LEAST_VOTED} places"
+        run.progress.warn(f"{problem}: {WRONG_CAMERAS}; the training starts from {instead} instead")
     if seeds == "random" or not run.path("seeds.ply").is_file():
         points = random_points(config.gaussians, views.box, generator)
     else:
@@ -63,7 +68,7 @@ def start_of_training(run, views, generator):
     return start_gaussians(points, generator, config.initial_scale, config.initial_opacity)
 
 
-def _swept(run, views):
+def _swept(run: "Run", views: Views) -> "tuple[Gaussians | None, str]":
     """Gaussians by sweeping, None where views agree in too few places; and the seeds to use: 'votes' if none can be."""
     from taichi_edges.seeding.sweeping import TOGETHER, can_sweep, swept_gaussians
 

@@ -1,6 +1,10 @@
 """Edges scored against a ground truth, both from files: for edges that come from elsewhere, too."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from taichi_edges.errors import UserError
 from taichi_edges.evaluation.ground_truth import as_it_is, read_ground_truth
@@ -10,7 +14,9 @@ from taichi_edges.geometry.wireframe import Wireframe
 from taichi_edges.views.cameras import Similarity
 
 
-def evaluate(edges, truth, box=None):
+def evaluate(
+    edges: Path | str | EdgeSet | Wireframe, truth: Path | str, box: ArrayLike | None = None
+) -> dict[str, Any]:
     """EMAP's metrics of edges against a ground truth, and those of the wireframe: the dict of docs/metrics.md.
 
     edges: path of an edge file (`edges.json`, EMAP's), EdgeSet or Wireframe. truth: path of an ABC folder, a sampled
@@ -32,7 +38,7 @@ def evaluate(edges, truth, box=None):
     return {**measure(edges.transformed(to_unit), known), "ground_truth": known.source}
 
 
-def _similarity(box):
+def _similarity(box: ArrayLike) -> Similarity:
     """The Similarity that brings a box as the user gives it into the unit cube."""
     corners = np.asarray(box, dtype=np.float64)
     if corners.shape != (2, 3) or not (corners[1] > corners[0]).all():

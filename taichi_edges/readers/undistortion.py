@@ -357,7 +357,7 @@ def _check_fits(path: Path, image: np.ndarray, plan: Plan) -> None:
 
 def _write(path: Path, image: np.ndarray) -> None:
     with replacing(path) as unfinished:
-        unfinished.write_bytes(cv2.imencode(".png", image, FAST_PNG)[1])
+        unfinished.write_bytes(cv2.imencode(".png", image, FAST_PNG)[1].tobytes())
 
 
 def brought(

@@ -11,7 +11,7 @@ INSTALLED, BESIDE = PACKAGE / "scenes", PACKAGE.parent / "scenes"  # in a checko
 SHIPPED = INSTALLED if INSTALLED.is_dir() else BESIDE
 
 
-def expand(text, origin):
+def expand(text: Path | str, origin: str) -> Path:
     """A path as the user wrote it, with `~` replaced; `origin` is where it was written, for the message."""
     try:
         return Path(text).expanduser()
@@ -19,7 +19,7 @@ def expand(text, origin):
         raise UserError(f"{origin}: {text}: '~' and what follows it name no user; write the path out") from error
 
 
-def data_folder(given=None):
+def data_folder(given: Path | str | None = None) -> Path | None:
     """The folder in which relative paths of scenes start: that given, or else of TAICHI_EDGES_DATA; None without."""
     origin, data = ("--data", given) if given else (DATA_ROOT, os.environ.get(DATA_ROOT))
     if not data:
@@ -30,12 +30,12 @@ def data_folder(given=None):
     return folder.resolve()
 
 
-def shipped_scenes():
+def shipped_scenes() -> dict[str, Path]:
     """{name: path} of the scene files that come along."""
     return {path.stem: path for path in sorted(SHIPPED.glob("*.yaml"))}
 
 
-def scene_path(text):
+def scene_path(text: Path | str) -> Path:
     """What the user names as a scene: a path, or the name of a scene that comes along where nothing lies there."""
     path = expand(text, "scene")
     if path.exists() or path.name != str(path):

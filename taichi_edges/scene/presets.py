@@ -1,9 +1,11 @@
 """Presets and scales: the values that a scene starts from, where they are not the defaults of `settings`."""
 
+from typing import Any
+
 from taichi_edges.scene.settings import SceneConfig
 
 # The schedule of the paper and its supplement, 500 epochs: 30 are a share of 0.06, 300 of 0.6.
-PAPER = {
+PAPER: dict[str, dict[str, Any]] = {
     "train": {
         "epochs": 500,
         "steps": 0,
@@ -45,7 +47,7 @@ PAPER = {
 }
 
 
-def _at_keys_of(pattern, values):
+def _at_keys_of(pattern: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
     """What the nested dict `values` holds at the keys of `pattern`."""
     return {
         key: _at_keys_of(below, values[key]) if isinstance(below, dict) else values[key]
@@ -56,11 +58,13 @@ def _at_keys_of(pattern, values):
 # Both name the same keys, so that one on the command line leaves nothing of the other; what they do not name is kept.
 PRESETS = {"paper": PAPER, "fast": _at_keys_of(PAPER, SceneConfig.model_construct().model_dump())}
 # What a preset says otherwise for scenes of other sizes, on top of it and below the scene file: SCALES[scale][preset].
-LARGE_IN_THE_PAPER = {  # supplement: "for large scenes" lambda_1 = lambda_2 = 0.01, k = 4 as ever, seeded by SfM points
+LARGE_IN_THE_PAPER: dict[
+    str, dict[str, Any]
+] = {  # supplement: "for large scenes" lambda_1 = lambda_2 = 0.01, k = 4 as ever, seeded by SfM points
     "train": {"seeds": "auto", "orient_weight": 0.01, "shape_weight": 0.01},
 }
 # Photographs of what surrounds the camera: much texture, poses from structure from motion, few views of every place.
-PHOTOGRAPHED = {
+PHOTOGRAPHED: dict[str, dict[str, Any]] = {
     "source": {"min_chain": 12, "tolerance_px": 0.7},
     "train": {"seeds": "sweep", "gaussians": 60_000, "steps": 200, "learning_rates": {"means": 1e-4}},
     "filter": {
@@ -76,11 +80,11 @@ PHOTOGRAPHED = {
     "refine": {"min_support": 0.15, "min_views": 2.0, "min_steadiness": 0.3},
 }
 # Photographers walk along facades, so that the depth of horizontal edges is for others to tell.
-SURROUNDING = {
+SURROUNDING: dict[str, dict[str, Any]] = {
     **PHOTOGRAPHED,
     "refine": {**PHOTOGRAPHED["refine"], "anchor": True},
 }
-SCALES = {
+SCALES: dict[str, dict[str, dict[str, Any]]] = {
     "part": {"paper": {}, "fast": {}},
     "object": {"paper": {}, "fast": PHOTOGRAPHED},
     "building": {"paper": LARGE_IN_THE_PAPER, "fast": SURROUNDING},

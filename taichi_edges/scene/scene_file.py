@@ -7,7 +7,9 @@ name of a scene that comes along stands for its file.
 
 import difflib
 import re
-from collections.abc import Mapping
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import yaml
 from pydantic import ValidationError
@@ -17,13 +19,17 @@ from taichi_edges.scene.paths import data_folder, expand, scene_path, shipped_sc
 from taichi_edges.scene.presets import PRESETS, SCALES, SCALES_OF_READERS
 from taichi_edges.scene.settings import SceneConfig, Section
 
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+Setting = tuple[tuple[str, ...], Any, str]  # the names on the way to a key, its value, and where that was given
 LISTING_SUFFIXES = (".json", ".npz", ".bin", ".txt")  # of files that list the views of a source
 
 
 class _SceneLoader(yaml.SafeLoader):
     """YAML 1.1 reads 1e-3 as a string; a number in a scene file is a number. Repeated keys are refused."""
 
-    def construct_mapping(self, node, deep=False):
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen = set()
         for key, _ in node.value:
             if isinstance(key.value, str) and key.value in seen:
@@ -47,7 +53,7 @@ _SceneLoader.add_implicit_resolver("tag:yaml.org,2002:int", _INT, list("-+012345
 _SceneLoader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789."))
 
 
-def parse_yaml(text, where):
+def parse_yaml(text: str, where: Path | str) -> Any:
     """YAML to Python; a syntax error becomes one line that names file, line and column."""
     try:
         return yaml.load(text, _SceneLoader)
@@ -60,7 +66,7 @@ def parse_yaml(text, where):
         raise UserError(f"{where}: not valid YAML: nested too deeply; is a bracket left open?") from error
 
 
-def merge(base, over):
+def merge(base: Any, over: Any) -> Any:
     """Nested dicts: what `over` names replaces what `base` has."""
     if not (isinstance(base, dict) and isinstance(over, dict)):
         return over
@@ -70,7 +76,7 @@ def merge(base, over):
     }
 
 
-def overlay(base, over):
+def overlay(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     """`merge`, where a length of the training given in epochs replaces one in steps and the other way round."""
     merged, train = merge(base, over), over.get("train")
     given = [key for key in ("epochs", "steps") if isinstance(train, dict) and train.get(key)]
@@ -79,7 +85,14 @@ def overlay(base, over):
     return merged
 
 
-def load_scene(path, preset=None, settings=(), seed=None, scale=None, data_root=None):
+def load_scene(
+    path: Path | str,
+    preset: str | None = None,
+    settings: Iterable[str] | Mapping[str, Any] = (),
+    seed: int | None = None,
+    scale: str | None = None,
+    data_root: Path | str | None = None,
+) -> SceneConfig:
     """Read and check a scene: a YAML file, the name of one that comes along, or a folder that the readers know.
 
     preset, scale: override the scene's, and the scene's own values where they name them.
@@ -97,7 +110,7 @@ def load_scene(path, preset=None, settings=(), seed=None, scale=None, data_root=
         content |= _scale_of_source({**_section(content), **_settings_of_source(parsed)}, data_root)
     content = overlay(_starting_values(preset or content.get("preset"), scale or content.get("scale")), content)
     content = _overridden(content, preset, scale)
-    origins = {}
+    origins: dict[tuple[str, ...], str] = {}
     for keys, value, origin in parsed:
         origins[keys] = origin
         content = overlay(content, _nested(keys, value))
@@ -107,28 +120,28 @@ def load_scene(path, preset=None, settings=(), seed=None, scale=None, data_root=
     return check_scene(content, path, origins)
 
 
-def _section(content):
+def _section(content: dict[str, Any]) -> dict[str, Any]:
     """The section `source` as the scene has it; {} where there is none."""
     source = content.get("source")
     return source if isinstance(source, dict) else {}
 
 
-def _settings_of_source(parsed):
-    """The keys of the section `source` that settings name. parsed: (keys, value, origin) of each."""
-    found = {}
+def _settings_of_source(parsed: Iterable[Setting]) -> dict[str, Any]:
+    """The keys of the section `source` that settings name."""
+    found: dict[str, Any] = {}
     for keys, value, _ in parsed:
         found |= _section(_nested(keys, value))
     return found
 
 
-def _nested(keys, value):
+def _nested(keys: tuple[str, ...], value: Any) -> Any:
     """('train', 'steps'), 300 -> {'train': {'steps': 300}}."""
     for name in reversed(keys):
         value = {name: value}
     return value
 
 
-def _scale_of_source(source, data_root):
+def _scale_of_source(source: dict[str, Any], data_root: Path | str | None) -> dict[str, str]:
     """{'scale': ...} for a scene of photographs, as its reader tells, named or recognised; {} for others."""
     reader = source.get("reader", "auto")
     if reader == "auto":
@@ -137,7 +150,7 @@ def _scale_of_source(source, data_root):
     return {} if scale is None else {"scale": scale}
 
 
-def _recognised_reader(text, data_root):
+def _recognised_reader(text: Any, data_root: Path | str | None) -> str | None:
     """The reader that fits what is at a source.path; None where that is unknown: the stage that reads it says why."""
     from taichi_edges.readers.recognition import recognise
 
@@ -155,19 +168,19 @@ def _recognised_reader(text, data_root):
         return None
 
 
-def is_source(path):
+def is_source(path: Path) -> bool:
     """Whether what was given in place of a scene file is the source itself: a folder, or a file that lists views."""
     return path.is_dir() or (path.suffix.lower() in LISTING_SUFFIXES and path.is_file())
 
 
-def _folder_content(path):
+def _folder_content(path: Path) -> dict[str, Any]:
     """The scene that a folder without a scene file is: its own path and name, everything else as by default."""
     from taichi_edges.readers.recognition import scene_name
 
     return {"name": scene_name(path), "source": {"reader": "auto", "path": str(path.resolve())}}
 
 
-def _file_content(path):
+def _file_content(path: Path) -> dict[str, Any]:
     """What a scene file says, with the file's name where it names no scene."""
     try:
         text = path.read_text(encoding="utf-8")
@@ -183,7 +196,7 @@ def _file_content(path):
     return {"name": path.stem, **content}
 
 
-def _starting_values(preset, scale):
+def _starting_values(preset: Any, scale: Any) -> dict[str, Any]:
     """What a scene starts from: its preset, and over it what the preset says for scenes of this scale."""
     preset = SceneConfig.model_fields["preset"].default if preset is None else preset
     scale = SceneConfig.model_fields["scale"].default if scale is None else scale
@@ -193,7 +206,7 @@ def _starting_values(preset, scale):
     return overlay(PRESETS[preset], of_scale.get(preset, {}))
 
 
-def _overridden(content, preset, scale):
+def _overridden(content: dict[str, Any], preset: str | None, scale: str | None) -> dict[str, Any]:
     """The scene with the preset and the scale of the command line, where there are any, over its own values."""
     of_scale = scale or content.get("scale")
     if preset is not None:
@@ -205,7 +218,7 @@ def _overridden(content, preset, scale):
     return content
 
 
-def _why_unreadable(path, error):
+def _why_unreadable(path: Path, error: OSError) -> str:
     """What is wrong with a scene's path; a scene of such a name that comes along or lies in the same folder is named."""
     shipped = shipped_scenes()
     if path.stem in shipped:
@@ -215,8 +228,8 @@ def _why_unreadable(path, error):
     return f"{error.strerror}{near or '; scenes that come along: ' + ', '.join(shipped)}"
 
 
-def _parse_settings(settings):
-    """[(keys, value, origin)]: (('train', 'steps'), 300, '--set train.steps=300'). settings: as `load_scene` takes."""
+def _parse_settings(settings: Iterable[str] | Mapping[str, Any]) -> list[Setting]:
+    """(('train', 'steps'), 300, 'train.steps=300') of each. settings: as `load_scene` takes."""
     if not isinstance(settings, Mapping):
         return [_parse_setting(setting) for setting in settings]
     parsed = [(tuple(key.split(".")), value, f"{key}={value!r}") for key, value in settings.items()]
@@ -225,7 +238,7 @@ def _parse_settings(settings):
     return parsed
 
 
-def _parse_setting(setting):
+def _parse_setting(setting: str) -> Setting:
     """'train.epochs=100' -> (('train', 'epochs'), 100, '--set train.epochs=100')."""
     key, equals, value = setting.partition("=")
     keys, origin = tuple(key.strip().split(".")), f"--set {setting}"
@@ -235,14 +248,16 @@ def _parse_setting(setting):
     return keys, parse_yaml(value, f"--set {key.strip()}"), origin
 
 
-def _refuse_bundle(keys, value, origin):
+def _refuse_bundle(keys: tuple[str, ...], value: Any, origin: str) -> None:
     """UserError where a setting is a preset or a scale."""
     if keys in (("preset",), ("scale",)):
         option = keys[0]
         raise UserError(f"{origin}: a {option} brings many values with it; use --{option}{value and ' '}{value}")
 
 
-def check_scene(content, where, origins=None):
+def check_scene(
+    content: dict[str, Any], where: Path | str, origins: Mapping[tuple[str, ...], str] | None = None
+) -> SceneConfig:
     """A dict -> SceneConfig; the first mistake becomes one line with file, key and what to do.
 
     where: the file, for the message. origins: {keys: text} names other places that values come from, e.g. `--set`.
@@ -278,7 +293,7 @@ _WORDS = {
 }
 
 
-def _describe(problem, count, where):
+def _describe(problem: "ErrorDetails", count: int, where: Path | str) -> str:
     """One line for pydantic's first finding."""
     location, context = problem["loc"], problem.get("ctx", {})
     key = ".".join(str(part) for part in location)
@@ -294,25 +309,26 @@ def _describe(problem, count, where):
     return f"{where}: {place}{message}{given}{f' ({meaning})' if meaning else ''}{more}"
 
 
-def _in_yaml(value):
+def _in_yaml(value: object) -> str:
     """A value as the user would write it: true, null, 'text'."""
     if isinstance(value, (dict, list)):
         return "a mapping" if isinstance(value, dict) else "a list"
     return {True: "true", False: "false", None: "null"}[value] if isinstance(value, (bool, type(None))) else repr(value)
 
 
-def _section_at(location):
-    """The Section class at `location`, a tuple of names; None where there is none."""
-    section = SceneConfig
+def _section_at(location: Sequence[int | str]) -> type[Section] | None:
+    """The Section class at `location`, the names on the way to it; None where there is none."""
+    section: type[Section] = SceneConfig
     for name in location:
-        field = section.model_fields.get(name)
-        section = field.annotation if field else None
-        if not (isinstance(section, type) and issubclass(section, Section)):
+        field = section.model_fields.get(str(name))
+        inside = field.annotation if field else None
+        if not (isinstance(inside, type) and issubclass(inside, Section)):
             return None
+        section = inside
     return section
 
 
-def _meaning(location):
+def _meaning(location: Sequence[int | str]) -> str:
     """What the key at `location` means, with its unit, as its field says."""
     names = [part for part in location if isinstance(part, str)]
     section = _section_at(names[:-1]) if names else None
@@ -320,12 +336,13 @@ def _meaning(location):
     return (field.description or "") if field else ""
 
 
-def _nearest_key(location):
+def _nearest_key(location: Sequence[int | str]) -> str:
     """A hint for an unknown key: the same key in another section, a similar one here or elsewhere, or all there are."""
-    name, known = str(location[-1]), list(_section_at(location[:-1]).model_fields)
-    places = {}
+    name, section_here = str(location[-1]), _section_at(location[:-1])
+    assert section_here is not None  # nothing else refuses keys
+    known, places = list(section_here.model_fields), dict[str, str]()
 
-    def collect(section, prefix):
+    def collect(section: type[Section], prefix: str) -> None:
         for key, value in section.model_fields.items():
             places.setdefault(key, f"{prefix}{key}")
             if isinstance(value.annotation, type) and issubclass(value.annotation, Section):
@@ -333,8 +350,8 @@ def _nearest_key(location):
 
     collect(SceneConfig, "")
     closeness = {key: difflib.SequenceMatcher(None, name, key).ratio() for key in places}
-    here = max(known, key=closeness.get)
-    anywhere = max(places, key=closeness.get)
+    here = max(known, key=closeness.__getitem__)
+    anywhere = max(places, key=closeness.__getitem__)
     if closeness[anywhere] > max(closeness[here], 0.7):
         return f"; did you mean '{places[anywhere]}'?"
     return did_you_mean(name, [here]) or f"; known here: {', '.join(known)}"

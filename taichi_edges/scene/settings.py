@@ -4,7 +4,8 @@ The defaults are the preset `fast` for a part. `presets` holds what another pres
 reads a scene from YAML.
 """
 
-from typing import Annotated, Literal
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import (
     BaseModel,
@@ -87,10 +88,10 @@ class SourceConfig(Section):
     size: Annotated[int, Field(ge=16)] = Field(400, description="synthetic: width and height of the views, pixels")
 
 
-def _measured_or(given, what):
+def _measured_or(given: Callable[[Any], bool], what: str) -> PlainValidator:
     """A validator that lets 'auto', 'off' (YAML reads it as false) and what `given` accepts pass."""
 
-    def check(value):
+    def check(value: Any) -> Any:
         if value is False or value == "off":
             return "off"
         if value is True or value == "auto":
@@ -102,16 +103,16 @@ def _measured_or(given, what):
     return PlainValidator(check)
 
 
-def _is_length(value):
+def _is_length(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) < MOST_BIAS
 
 
-def _is_shift(value):
+def _is_shift(value: Any) -> bool:
     return isinstance(value, list) and len(value) == 2 and all(map(_is_length, value))
 
 
 class CalibrationConfig(Section):
-    """Biases of ready or learned edge maps, see detectors/calibration.py. `calibration: off` switches both off."""
+    """Biases of ready or learned edge maps, see calibration/calibration.py. `calibration: off` switches both off."""
 
     shift: Annotated[
         str | list[float], _measured_or(_is_shift, f"[right, down] in pixels, less than {MOST_BIAS:g} each")
@@ -195,13 +196,13 @@ class TrainConfig(Section):
     density: DensityConfig = DensityConfig()
 
     @model_validator(mode="after")
-    def _has_one_length(self):
+    def _has_one_length(self) -> "TrainConfig":
         if bool(self.epochs) == bool(self.steps):
             raise ValueError("the length is given in epochs or in steps; set one of them, and the other to 0")
         return self
 
     @property
-    def takes_in_flanks(self):
+    def takes_in_flanks(self) -> bool:
         """Whether the mask of eq. 3 takes in the flanks of the lines; a whole image has them anyway."""
         return self.loss == "balanced" and self.flanks_from < 1
 
@@ -265,12 +266,17 @@ class RefineConfig(Section):
     )
 
 
-def _auto_or(value, check):
-    """A union with 'auto' would name the alternatives in its messages, not what is wrong with the list."""
+def _auto_or(value: Any, check: Callable[[Any], Any]) -> Any:
     return value if value == "auto" else check(value)
 
 
-def _is_held_out(value):
+if TYPE_CHECKING:
+    BoxOrAuto = Box | Literal["auto"]
+else:  # as a union its messages would name the alternatives, not what is wrong with the list
+    BoxOrAuto = Annotated[Box, WrapValidator(_auto_or), PlainSerializer(lambda box: box)]
+
+
+def _is_held_out(value: Any) -> bool:
     names = isinstance(value, list) and value and all(isinstance(name, str) for name in value)
     return bool(names) or (type(value) is int and value > 0)
 
@@ -298,7 +304,7 @@ class EvaluationConfig(Section):
     )
 
     @model_validator(mode="after")
-    def _scan_is_there(self):
+    def _scan_is_there(self) -> "EvaluationConfig":
         if self.kind == "scan" and not self.truth.lower().endswith(".ply"):
             raise ValueError("kind is 'scan', so truth must name the PLY with the points of the scan")
         return self
@@ -313,7 +319,7 @@ class SceneConfig(Section):
         "part", description="settings for a part without texture, a photographed object, what surrounds the camera"
     )
     seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of every random choice")
-    box: Annotated[Box, WrapValidator(_auto_or), PlainSerializer(lambda box: box)] = Field(
+    box: BoxOrAuto = Field(
         "auto", description="opposite corners of the scene, input units; auto: the layout's, else the unit cube"
     )
     source: SourceConfig = SourceConfig()
@@ -327,20 +333,20 @@ class SceneConfig(Section):
 
     @field_validator("calibration", mode="before")
     @classmethod
-    def _all_or_nothing(cls, value):
+    def _all_or_nothing(cls, value: Any) -> Any:
         if value is False or value == "off":
             return {"shift": "off", "silhouette": "off"}
         return {} if value is True or value == "auto" else value
 
     @field_validator("box")
     @classmethod
-    def _box_has_volume(cls, box):
+    def _box_has_volume(cls, box: BoxOrAuto) -> BoxOrAuto:
         if box != "auto" and any(high <= low for low, high in zip(*box)):
             raise ValueError("the second corner must be greater than the first in x, y and z")
         return box
 
     @model_validator(mode="after")
-    def _source_is_complete(self):
+    def _source_is_complete(self) -> "SceneConfig":
         if self.source.reader != "synthetic" and not self.source.path:
             raise ValueError("source.path is missing; set it to the folder with the images and cameras")
         if self.train.seeds == "points" and not self.source.points and self.source.reader not in WITH_POINTS:
