@@ -162,17 +162,17 @@ def measure_view(edgels, truth, image, mesh, lens, pose, map_path):
     to_truth, nearest = cKDTree(pixels).query(points)
     cosines = np.abs((directions * normals[nearest]).sum(axis=1))
     good = (to_truth < 2.0) & (cosines > PARALLEL)
-    return dict(
-        away=cKDTree(points).query(pixels)[0],
-        alone=alone,
-        crease=alone & (sides == 0),
-        lost=np.minimum(to_truth, cKDTree(contours).query(points)[0]) > FAR_PX,
-        offsets=((points - pixels[nearest]) * normals[nearest]).sum(axis=1)[good],
-        normals=normals[nearest][good],
-        sides=sides[nearest][good],
-        angles=np.degrees(np.arccos(cosines[good].clip(max=1))),
-        length=len(points),
-    )
+    return {
+        "away": cKDTree(points).query(pixels)[0],
+        "alone": alone,
+        "crease": alone & (sides == 0),
+        "lost": np.minimum(to_truth, cKDTree(contours).query(points)[0]) > FAR_PX,
+        "offsets": ((points - pixels[nearest]) * normals[nearest]).sum(axis=1)[good],
+        "normals": normals[nearest][good],
+        "sides": sides[nearest][good],
+        "angles": np.degrees(np.arccos(cosines[good].clip(max=1))),
+        "length": len(points),
+    }
 
 
 def report(name, rows):

@@ -36,7 +36,7 @@ def make_scene(view_count, width, height, seed=0):
     curves = make_curves(np.random.default_rng(seed))
     intrinsics, poses = make_cameras(view_count, width, height)
     edge_maps = np.full((view_count, height, width), 0, np.uint8)  # written to, so that it counts as memory in use
-    for edge_map, *camera in zip(edge_maps, intrinsics, poses):
+    for edge_map, *camera in zip(edge_maps, intrinsics, poses, strict=True):
         draw(edge_map, curves, *camera)
     return EdgeScene(curves, edge_maps, intrinsics, poses)
 

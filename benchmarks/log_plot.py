@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -98,9 +99,9 @@ def _draw_panel(canvas, panel):
     canvas.text((left, 20), panel.title, TEXT)
     label_at = left
     canvas.text(((low[0] + high[0]) / 2, PANEL[1] - 22), panel.x_label, TEXT, 0.5)
-    for curve, colour in zip(panel.curves, COLOURS):
+    for curve, colour in zip(panel.curves, COLOURS, strict=False):
         points = [place(x, y) for x, y in zip(curve.xs, curve.ys, strict=True)]
-        for one, other in zip(points, points[1:]):
+        for one, other in pairwise(points):
             canvas.line(one, other, colour, 2)
         for point in points:
             canvas.mark(point, colour)

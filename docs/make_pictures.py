@@ -61,7 +61,8 @@ def main(folder, view_name, out):
     """Write the picture of one view of the run in `folder`."""
     folder = Path(folder)
     if "," in view_name:
-        return draw_views(folder, view_name.split(","), out)
+        draw_views(folder, view_name.split(","), out)
+        return
     views = read_views(folder / "views.npz")
     view = views.names.index(view_name)
     wireframe, _ = read_wireframe(folder / "edges.json")

@@ -33,7 +33,7 @@ class Progress:
 class _Task:
     def __init__(self, progress: Progress, title: str, total: int) -> None:
         self.progress, self.title, self.total = progress, title, total
-        self.handle: "TaskID | None" = None  # of its bar
+        self.handle: TaskID | None = None  # of its bar
 
     def __enter__(self) -> "_Task":
         self.started = self.reported = time.monotonic()

@@ -4,7 +4,7 @@ import gc
 import os
 import subprocess
 import sys
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def pytest_report_header():
     return f"random inputs: repeat with TEST_SEED={SEED}"
 
 
-@lru_cache(maxsize=None)
+@cache
 def offers(arch):
     """Whether Taichi gets such a device here; asked of another process, which a broken driver may take with it."""
     command = [sys.executable, "-c", PROBE, arch]

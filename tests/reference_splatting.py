@@ -7,7 +7,7 @@ jump wherever the step carries a pixel over a cut.
 """
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 
@@ -129,7 +129,7 @@ class Scene:
         return self.intrinsics[view], self.world_to_camera[view]
 
 
-@lru_cache(maxsize=None)
+@cache
 def random_scene(seed, width=50, height=40, grey=True):
     """Five views of the unit cube with random maps in all grey levels, or in black and white.
 

@@ -1,7 +1,8 @@
 """Columns: arrays of equal length that belong together, with a row for each of the things they describe."""
 
+from collections.abc import Sequence
 from dataclasses import fields, replace
-from typing import Sequence, TypeVar
+from typing import TypeVar
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The edgels that the views of a run go on with: traced in maps, masked, calibrated, on long chains; and their report."""
+"""The edgels that the views of a run go on with: traced in maps, masked, calibrated, on long chains; their report."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any

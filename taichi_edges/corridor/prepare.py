@@ -1,4 +1,4 @@
-"""The stage `prepare`: from a source of images, maps and cameras to Views, whatever layout, lens or detector it takes."""
+"""The stage `prepare`: from a source of images, maps and cameras to Views, whatever layout, lens or detector."""
 
 import os
 from dataclasses import replace

@@ -132,7 +132,7 @@ def single_width(edge_maps: Iterable[np.ndarray], width_px: float, threshold: fl
     """
     halves = []
     for edge_map in edge_maps:
-        points, normals, values = ridge_points(edge_map, _sigma(width_px), threshold)
+        points, normals, _ = ridge_points(edge_map, _sigma(width_px), threshold)
         chosen = np.linspace(0, len(points) - 1, min(len(points), WIDTH_EDGELS)).astype(np.int64)
         sides = [_half_width(edge_map, points[chosen], sign * normals[chosen], 2 * width_px) for sign in (1, -1)]
         halves.append(np.minimum(*sides))

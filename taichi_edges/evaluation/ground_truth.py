@@ -13,6 +13,7 @@ the function `to_unit`, so that a "mm" means the same whatever the units of the 
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -218,7 +219,7 @@ def sample_mesh_segments(polyline: np.ndarray) -> np.ndarray:
     That order is EMAP's, and shows where a segment gets a single point.
     """
     samples = [np.zeros((0, 3))]
-    for start, end in zip(polyline[:-1], polyline[1:], strict=True):
+    for start, end in pairwise(polyline):
         count = int(np.linalg.norm(end - start) // ABC_SPACING)
         weights = np.linspace(0.0, 1.0, count)[:, None]
         samples.append(weights * start + (1.0 - weights) * end)

@@ -200,6 +200,7 @@ def metrics_rows(metrics: Mapping[str, float | None]) -> list[tuple[str, str]]:
     """The dict of `evaluate` as rows (label, value with unit) for printing."""
     metrics = defaultdict(lambda: None, metrics)  # a run that an earlier version has scored lacks some
     true_length = number_text(metrics["true_length_units"])
+    true_duplicated = number_text(metrics["true_duplicated_length_percent"], "{:.1f} %")
     rows = [
         ("lines, curves", f"{metrics['lines']}, {metrics['curves']}"),
         ("edges", f"{metrics['edges']} (truth {number_text(metrics['true_edges'], '{:d}')})"),
@@ -207,8 +208,7 @@ def metrics_rows(metrics: Mapping[str, float | None]) -> list[tuple[str, str]]:
         ("length / true length", number_text(metrics["predicted_to_true_length_percent"], "{:.1f} %")),
         (
             "duplicated length",
-            f"{metrics['duplicated_length_percent']:.1f} % "
-            f"(truth {number_text(metrics['true_duplicated_length_percent'], '{:.1f} %')})",
+            f"{metrics['duplicated_length_percent']:.1f} % (truth {true_duplicated})",
         ),
         ("corners closed", joints_text(metrics, "corners")),
         ("tangential joints closed", joints_text(metrics, "tangential_joints")),

@@ -1,6 +1,7 @@
 """A chain of cubic Beziers as one cubic B-spline: the same points, in the form that CAD files hold."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -33,7 +34,7 @@ def joined(curves: np.ndarray) -> BSpline:
     continuous: the joint follows from its two neighbours, and a double knot does. The points stay the same.
     """
     spans, multiplicities, control = [1.0], [DEGREE + 1], [curves[0, 0], curves[0, 1]]
-    for before, after in zip(curves[:-1], curves[1:], strict=True):
+    for before, after in pairwise(curves):
         into, out = (float(np.linalg.norm(handle)) for handle in (before[3] - before[2], after[1] - after[0]))
         smooth = _is_smooth(before[2], before[3], after[1], into, out)
         spans.append(spans[-1] * (out / into if smooth else 1.0))

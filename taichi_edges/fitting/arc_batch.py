@@ -37,7 +37,9 @@ class ArcBatch(Columns):
 
     def __iter__(self) -> Iterator[Arc]:
         """One Arc after the other."""
-        rows = zip(*(getattr(self, name) for name in VECTORS), *(getattr(self, name).tolist() for name in ENDS))
+        rows = zip(
+            *(getattr(self, name) for name in VECTORS), *(getattr(self, name).tolist() for name in ENDS), strict=True
+        )
         return (Arc(*row) for row in rows)
 
     def put(self, numbers: np.ndarray, others: "ArcBatch") -> "ArcBatch":

@@ -172,7 +172,7 @@ def fit_arc(
         arc = replace(arc, bend=np.zeros(3))
     for _ in range(rounds):
         along, offsets = arc.coordinates(points)
-        tangent, inward, normal = arc.frame
+        _, inward, normal = arc.frame
         weights = geman_mcclure((offsets**2).sum(axis=1) / tolerance**2, shares)
         bent, terms = arc.curvature, 2 if straight else 3
         cosine, sine = np.cos(bent * along), _sine(along, bent)

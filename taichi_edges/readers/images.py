@@ -46,7 +46,10 @@ def frames_with_images(frames: Frames, progress: Progress) -> Frames:
 
 def refuse_copies(frames: Frames, progress: Progress) -> None:
     """UserError where all pictures are one and the same file; copies among others are named in a warning."""
-    paths = [next((Path(p) for p in pair if is_usable(p)), None) for pair in zip(frames.image_paths, frames.edge_paths)]
+    paths = [
+        next((Path(p) for p in pair if is_usable(p)), None)
+        for pair in zip(frames.image_paths, frames.edge_paths, strict=True)
+    ]
     kinds: dict[str, list[str]] = {}
     for name, path in zip(frames.names, paths, strict=True):
         if path is not None:

@@ -219,7 +219,7 @@ def _overridden(content: dict[str, Any], preset: str | None, scale: str | None) 
 
 
 def _why_unreadable(path: Path, error: OSError) -> str:
-    """What is wrong with a scene's path; a scene of such a name that comes along or lies in the same folder is named."""
+    """What is wrong with a scene's path; one of a like name that comes along or lies in the same folder is named."""
     shipped = shipped_scenes()
     if path.stem in shipped:
         return f"{error.strerror}; for the scene that comes along give its name alone: {path.stem}"
@@ -267,7 +267,7 @@ def check_scene(
     except ValidationError as error:
         problem = error.errors()[0]
         for keys, text in (origins or {}).items():
-            if all(mine == theirs for mine, theirs in zip(keys, problem["loc"])) and problem["loc"]:
+            if all(mine == theirs for mine, theirs in zip(keys, problem["loc"], strict=False)) and problem["loc"]:
                 where = text
         raise UserError(_describe(problem, len(error.errors()), where)) from error
 

@@ -69,7 +69,7 @@ class SourceConfig(Section):
     gamma: Annotated[float, Field(ge=0, le=10)] = Field(
         0.0, description="how images encode light, for `subpixel`: value = light^(1/gamma); 0: sRGB, as PNG and JPEG do"
     )
-    onnx: OnnxConfig = Field(default_factory=lambda: OnnxConfig())
+    onnx: OnnxConfig = Field(default_factory=OnnxConfig)
     split: str = Field("train", description="nerf: which transforms_<split>.json")
     axes: Literal["auto", "opengl", "opencv"] = Field("auto", description="camera axes; auto: what the layout means")
     model: str = Field("", description="colmap: folder of the model inside `path`, e.g. sparse/1; '': the largest")
@@ -341,7 +341,7 @@ class SceneConfig(Section):
     @field_validator("box")
     @classmethod
     def _box_has_volume(cls, box: BoxOrAuto) -> BoxOrAuto:
-        if box != "auto" and any(high <= low for low, high in zip(*box)):
+        if box != "auto" and any(high <= low for low, high in zip(*box, strict=True)):
             raise ValueError("the second corner must be greater than the first in x, y and z")
         return box
 

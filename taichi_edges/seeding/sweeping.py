@@ -187,16 +187,16 @@ def sweep_rays(
 @ti.func
 def most_agreeing(tally):
     """The largest count of a tally, and the angle of the directions there, in halves of a bin, 0..ANGLES - 1."""
-    best, bin = 0, 0
+    best, winner = 0, 0
     for b in range(BINS):
         count = count_in(tally, b)
         if count > best:
-            best, bin = count, b
-    if bin == 0 and count_in(tally, BINS - 1) == best:
-        bin = BINS - 1
+            best, winner = count, b
+    if winner == 0 and count_in(tally, BINS - 1) == best:
+        winner = BINS - 1
     # The middle of bins b and b + 1 is where b + 1 begins; where the next two hold as many, all lie in b + 1.
-    both = 1 if count_in(tally, (bin + 1) % BINS) == best else 0
-    return best, (2 * bin + 2 + both) % ANGLES
+    both = 1 if count_in(tally, (winner + 1) % BINS) == best else 0
+    return best, (2 * winner + 2 + both) % ANGLES
 
 
 @ti.func

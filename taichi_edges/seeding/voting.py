@@ -237,7 +237,7 @@ def score_cells(
         points = low + (points + generator.random(points.shape)) * size
         scores = mean_scores(views, distances, points)
         found.append((points[scores > chance], scores[scores > chance]))
-    return tuple(np.concatenate(arrays) for arrays in zip(*found))
+    return tuple(np.concatenate(arrays) for arrays in zip(*found, strict=True))
 
 
 def mean_scores(views: Views, distances: DistanceBatches, points: np.ndarray) -> np.ndarray:

@@ -139,7 +139,7 @@ def make_project(gaussians: "GaussianFields", cameras: CameraFields, target: Spl
     def project(count: ti.i32, view: ti.i32):
         for i in range(count):
             if boxes[i][1] > boxes[i][0]:
-                splat, variances, depth = splat_of(i, view)
+                splat, _, _ = splat_of(i, view)
                 splats[i] = splat
 
     return project

@@ -6,6 +6,7 @@ They are drawn in the units of `profiles`, one unit long. In a view of the defau
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -47,7 +48,7 @@ def shaft() -> Part:
 def meridian(points: Points) -> Path:
     """The path of straight lines through (r, z) `points`, in pixels."""
     points = PIXEL * np.asarray(points, dtype=np.float64)
-    return Path(tuple(line(one, other) for one, other in zip(points, points[1:])))
+    return Path(tuple(line(one, other) for one, other in pairwise(points)))
 
 
 def fillet() -> Part:
@@ -73,7 +74,7 @@ def rims() -> Part:
     outlines = [rectangle((inset, inset), size - inset, corner - inset) for inset in insets]
     inside = [*outlines[1:], circle(middle, 48 * PIXEL)]
     surfaces = [cap(Profile(outlines[0]), 0.0, upward=False)]
-    for outline, inner, bottom, top in zip(outlines, inside, [0.0, *tops], tops):
+    for outline, inner, bottom, top in zip(outlines, inside, [0.0, *tops[:-1]], tops, strict=True):
         surfaces += [wall(outline, bottom, top), cap(Profile(outline, (inner,)), top, upward=True)]
     steps = [(48, 13), (48, 14.5), (40, 14.5), (40, 15)]
     groove, ridge = [(32, 15), (32, 13.5), (31, 13.5), (31, 15)], [(22, 15), (22, 17), (20, 17), (20, 15)]
@@ -92,7 +93,7 @@ def grille() -> Part:
     rises = bow * (np.arange(columns) - 2.0) ** 2
     opening = np.array([(0.0, 0.0), (wide, slant), (wide, tall + slant), (0.0, tall)])
     pitch = tall + 2 * bar + wide
-    slots = [polygon(opening + corner) for low in (bar, bar + pitch) for corner in zip(lefts, low + rises)]
+    slots = [polygon(opening + corner) for low in (bar, bar + pitch) for corner in zip(lefts, low + rises, strict=True)]
     centres = np.column_stack([lefts + wide / 2, rises + tall + (slant + wide) / 2 + 2 * bar])
     holes = [circle(centre, wide / 2) for centre in centres]
     outline = rectangle((0.0, 0.0), (1.0, pitch + tall + slant + rises.max() + 2 * bar))

@@ -1,6 +1,7 @@
 """The parts themselves. `PARTS[name]()` makes one."""
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 
@@ -84,7 +85,7 @@ def knob() -> Part:
     grip = curve([(0.24, 0.14), (0.10, 0.34), (0.16, 0.52), (0.38, 0.56)])
     points = [(0, 0), (0.42, 0), (0.42, 0.14), (0.24, 0.14)]
     top = curve([(0.38, 0.62), (0.30, 0.72), (0.15, 0.74), (0.0, 0.74)])
-    lines = [line(one, other) for one, other in zip(points, points[1:])]
+    lines = [line(one, other) for one, other in pairwise(points)]
     return revolve("knob", Path((*lines, grip, line((0.38, 0.56), (0.38, 0.62)), top)))
 
 

@@ -6,6 +6,7 @@ drawn about one unit long). Angles are degrees, counter-clockwise.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -60,7 +61,7 @@ class Path:
     segments: tuple[Segment, ...]
 
     def __post_init__(self) -> None:
-        for one, other in zip(self.segments, self.segments[1:]):
+        for one, other in pairwise(self.segments):
             assert np.allclose(one.flat[-1], other.flat[0], atol=1e-9), (one.flat[-1], other.flat[0])
 
     @property
@@ -168,7 +169,7 @@ def polygon(corners: Points, radii: np.ndarray | Sequence[float] | None = None) 
     corners = np.asarray(corners, dtype=np.float64)
     radii = np.zeros(len(corners)) if radii is None else radii
     segments = []
-    for index, (corner, radius) in enumerate(zip(corners, radii)):
+    for index, (corner, radius) in enumerate(zip(corners, radii, strict=True)):
         before, after = corners[index - 1], corners[(index + 1) % len(corners)]
         # A sharp corner is a segment of no length: `join` draws the lines from one to the next.
         segments.append(corner_arc(before, corner, after, radius) if radius else line(corner, corner))

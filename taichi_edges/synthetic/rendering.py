@@ -106,7 +106,7 @@ def render_edge_maps(
     spacing = SAMPLE_PX * pixel_size(intrinsics, world_to_camera)
     edges = sample_edges(part, spacing)
     edge_maps = np.empty((len(intrinsics), image_size, image_size), np.uint8)
-    for view, (lens, pose) in enumerate(zip(intrinsics, world_to_camera)):
+    for view, (lens, pose) in enumerate(zip(intrinsics, world_to_camera, strict=True)):
         centre = camera_centre(pose)
         samples = edges.with_further(sample_contours(part, centre, spacing)) if imperfections.contours else edges
         pixels, _ = project(samples.points, lens, pose)
@@ -120,7 +120,9 @@ def render_edge_maps(
 def render_pictures(part: "Part", intrinsics: np.ndarray, world_to_camera: np.ndarray, image_size: int) -> np.ndarray:
     """(V, H, W, 3) uint8 RGB shaded pictures on white."""
     scene = ray_scene(part)
-    return np.stack([render_picture(part, scene, *camera, image_size) for camera in zip(intrinsics, world_to_camera)])
+    return np.stack(
+        [render_picture(part, scene, *camera, image_size) for camera in zip(intrinsics, world_to_camera, strict=True)]
+    )
 
 
 def render_picture(

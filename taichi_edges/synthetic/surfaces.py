@@ -103,7 +103,7 @@ def revolved(path: Path, centre: Point = (0.0, 0.0)) -> Surface:
     shift = np.append(np.asarray(centre, dtype=np.float64), 0.0)
     meridian = path.polygon if not path.closed else np.vstack([path.polygon, path.polygon[:1]])
     rings = np.stack([lift(radius * directions, height) for radius, height in meridian])
-    joints = [s.flat[0] for s, sharp in zip(path.segments, path.sharp) if sharp]
+    joints = [s.flat[0] for s, sharp in zip(path.segments, path.sharp, strict=True) if sharp]
     joints += [] if path.closed else [path.segments[-1].flat[-1]]
     edges = [lift(radius * turn.points, height) + shift for radius, height in joints if radius > 1e-9]
     return Surface(grid_triangles(rings + shift), tuple(edges))

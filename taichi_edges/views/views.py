@@ -37,7 +37,7 @@ class Views:
     intrinsics: np.ndarray
     world_to_camera: np.ndarray
     image_paths: tuple[str, ...]
-    similarity: Similarity = Similarity()
+    similarity: Similarity = field(default_factory=Similarity)
     box: np.ndarray = field(default_factory=lambda: np.array([[0.0, 0, 0], [1, 1, 1]]))
     input_to_truth: np.ndarray = field(default_factory=lambda: np.eye(4))
     edgels: Edgels | None = None
@@ -45,7 +45,7 @@ class Views:
     tolerance_px: float = 0.5
 
     def __post_init__(self) -> None:
-        count, height, width = self.edge_maps.shape
+        count = len(self.edge_maps)
         assert self.edge_maps.dtype == np.uint8, self.edge_maps.dtype
         assert len(self.names) == len(self.image_paths) == count and len(set(self.names)) == count
         assert self.intrinsics.shape == (count, 3, 3) and self.world_to_camera.shape == (count, 3, 4)
