@@ -365,6 +365,8 @@ def test_every_stage_can_say_what_it_found():
     refined = {"edges": 1, "vertices": 2, **asdict(RefineCounts(duplicates=1, unsupported=2))}
     left_out = "left out: 1 duplicate, 2 edges without support in the images"
     assert FINDINGS["refine"](refined) == f"1 edge, 2 vertices; {left_out}"
+    anchored = "1 edge, 2 vertices; 2 lines anchored to edges that they meet"
+    assert FINDINGS["refine"]({"edges": 1, "vertices": 2, **asdict(RefineCounts(anchored=2))}) == anchored
 
 
 # --------------------------------------------------------------------------------------- skipping and running again

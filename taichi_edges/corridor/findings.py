@@ -76,7 +76,7 @@ def describe_refine(facts):
     done = [
         (facts["joined"], "stroke joined to others", "strokes joined to others"),
         (facts["circles"], "circle completed", "circles completed"),
-        (facts["anchored"], "line hung up on others", "lines hung up on others"),
+        (facts["anchored"], "line anchored to edges that it meets", "lines anchored to edges that they meet"),
         (facts["lines"], "line added", "lines added"),
     ]
     changed = ", ".join(amount(*each) for each in done if each[0])

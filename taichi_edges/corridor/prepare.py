@@ -57,9 +57,7 @@ def _scene_box(run, frames):
         return run.config.box, "scene"
     if frames.box is not None:
         corners = " to ".join("(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in frames.box)
-        run.progress.say(
-            f"scene box {corners}, in units of the cameras, as the layout has it; the key box sets another"
-        )
+        run.progress.say(f"scene box {corners}, taken from the input and in its units; if it is wrong, set box")
         return frames.box, "reader"
     if frames.points is not None:  # a reader takes even points that fit badly rather than none
         found = f"only {amount(len(frames.points), 'good point')}" if len(frames.points) else "no points"
