@@ -170,7 +170,7 @@ def _prepare_synthetic(run):
         with replacing(run.path(file)) as unfinished:
             unfinished.write_bytes(cv2.imencode(".png", picture[:, :, ::-1])[1])
     views = replace(views, image_paths=tuple(files))
-    if source.detector in ("subpixel", "onnx"):
+    if source.detector not in ("auto", "maps"):
         views = _detected_in_pictures(run, views)
     write_edges(run.path("truth.json"), part.edges, {"part": part.name})
     facts = finish_views(run, views)

@@ -110,7 +110,7 @@ def _is_shift(value):
 
 
 class CalibrationConfig(Section):
-    """Biases of ready or learned edge maps, see detectors/calibration.py. `calibration: off` switches both off."""
+    """Biases of ready or learned edge maps, see calibration/calibration.py. `calibration: off` switches both off."""
 
     shift: Annotated[
         str | list[float], _measured_or(_is_shift, f"[right, down] in pixels, less than {MOST_BIAS:g} each")
