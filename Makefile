@@ -1,21 +1,21 @@
-# make demo   set up .venv if needed, run the embedded demo, say where the pictures are
-# make test   set up .venv if needed, run the tests
-# make lock   resolve requirements.lock anew from setup.cfg (needs uv)
-# make clean  remove .venv and runs
-# Python 3.10 to 3.12; another one than python3: make demo PYTHON=python3.12
+# `make` or `make help` lists the targets: what stands behind ## after them.
 
 PYTHON ?= python3
 VENV ?= .venv
 RUN := $(VENV)/bin/python
 
-.PHONY: demo test setup lock clean
-demo: setup
+.PHONY: help demo test setup lock clean
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@echo "Python 3.10 to 3.12; another one than $(PYTHON): make demo PYTHON=python3.12"
+
+demo: setup ## run the embedded demo scene, no download; results in runs/demo/
 	$(RUN) run.py scenes/demo.yaml
 
-test: setup
+test: setup ## run all tests
 	$(RUN) -m pytest -q -rs
 
-setup: $(VENV)/ready
+setup: $(VENV)/ready ## install what is needed into .venv (the other targets do so by themselves)
 	@sh tools/system-libraries $(RUN)
 
 # Reinstalled only when the requirements change.
@@ -26,8 +26,8 @@ $(VENV)/ready: requirements.lock setup.cfg setup.py pyproject.toml
 	$(RUN) -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	@touch $@
 
-lock:
+lock: ## resolve requirements.lock anew from setup.cfg (needs uv)
 	uv pip compile --universal --python-version 3.10 --extra test --no-header --no-annotate --constraint tools/lock-constraints.txt setup.cfg --output-file requirements.lock
 
-clean:
+clean: ## remove .venv and runs
 	rm -rf $(VENV) runs

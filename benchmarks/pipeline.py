@@ -30,8 +30,17 @@ ROOT = Path(__file__).resolve().parent.parent
 METRICS = {
     "Acc mm": ("accuracy_mm", "{:.2f}"),
     "Comp mm": ("completeness_mm", "{:.2f}"),
+    "P5 %": ("precision_5mm_percent", "{:.1f}"),
+    "R5 %": ("recall_5mm_percent", "{:.1f}"),
     "F5 %": ("f_score_5mm_percent", "{:.1f}"),
     "F10 %": ("f_score_10mm_percent", "{:.1f}"),
+    "true edges": ("true_edges", "{:d}"),
+    "edges": ("edges", "{:d}"),
+    "length %": ("predicted_to_true_length_percent", "{:.1f}"),
+    "corners closed %": ("corners_closed_percent", "{:.0f}"),
+    "free ends at corners": ("free_ends_at_corners", "{:d}"),
+    "exact mean mm": ("exact_mean_mm", "{:.2f}"),
+    "exact p95 mm": ("exact_p95_mm", "{:.2f}"),
 }
 HELD_OUT = {
     "views held out": ("held_out_views", "{:d}"),
@@ -51,11 +60,13 @@ HELD_OUT = {
 class Measured:
     """One run.
 
-    wall: seconds of the whole command. stages: {name: (seconds, peak MiB)}. peak: MiB of the process. metrics: as in
-    metrics.json. compiled: how many kernels had to be compiled.
+    wall: seconds of the whole command. processor: seconds of all its threads, which others on the machine hardly
+    lengthen. stages: {name: (seconds, peak MiB)}. peak: MiB of the process. metrics: as in metrics.json. compiled: how
+    many kernels had to be compiled.
     """
 
     wall: float
+    processor: float
     stages: dict
     peak: float
     metrics: dict
@@ -74,13 +85,17 @@ def missing_data(scene, data_root):
     return None
 
 
-def run_scene(scene, preset, options, cache):
-    """Run the command once in a new folder; its artefacts are thrown away. cache: XDG_CACHE_HOME. Returns Measured."""
+def run_scene(scene, preset, seed, options, cache):
+    """Run the command once in a new folder; its artefacts are thrown away. Returns Measured.
+
+    preset, seed: None for those of the scene. cache: XDG_CACHE_HOME.
+    """
     known, environment = compiled_kernels(cache), {**os.environ, "XDG_CACHE_HOME": str(cache)}
     with tempfile.TemporaryDirectory() as out, tempfile.TemporaryFile("w+") as messages:
         command = [sys.executable, str(ROOT / "run.py"), str(scene), "--out", out, "--quiet"]
         command += ["--threads", str(options.threads), "--arch", options.arch]
         command += ["--preset", preset] if preset else []
+        command += ["--seed", str(seed)] if seed is not None else []
         started = time.perf_counter()
         process = subprocess.Popen(
             command, stdout=subprocess.DEVNULL, stderr=messages, env=environment, cwd=ROOT, text=True
@@ -97,32 +112,34 @@ def run_scene(scene, preset, options, cache):
     stages = {name: (stage["seconds"], stage["peak_memory_mib"]) for name, stage in record["stages"].items()}
     # The stages reset the system's record of the peak, so that of the process covers only what comes after the last.
     peak = max(maxrss_mib(usage), *(peak for _, peak in stages.values()))
-    return Measured(wall, stages, peak, metrics, len(compiled_kernels(cache) - known))
+    processor = usage.ru_utime + usage.ru_stime
+    return Measured(wall, processor, stages, peak, metrics, len(compiled_kernels(cache) - known))
 
 
-def measure(scene, preset, options):
+def measure(scene, preset, seed, options):
     """`options.repeats` runs that found their kernels compiled, or with --cold as many that did not."""
     if options.cold:
-        return [run_cold(scene, preset, options) for _ in range(options.repeats)]
-    first = run_scene(scene, preset, options, benchmark_cache())
+        return [run_cold(scene, preset, seed, options) for _ in range(options.repeats)]
+    first = run_scene(scene, preset, seed, options, benchmark_cache())
     if first.compiled:
         print(f"{scene.stem}: {first.compiled} kernels had to be compiled; that run does not count", file=sys.stderr)
     runs = [] if first.compiled else [first]
-    return runs + [run_scene(scene, preset, options, benchmark_cache()) for _ in range(options.repeats - len(runs))]
+    more = options.repeats - len(runs)
+    return runs + [run_scene(scene, preset, seed, options, benchmark_cache()) for _ in range(more)]
 
 
-def run_cold(scene, preset, options):
+def run_cold(scene, preset, seed, options):
     """One run with an empty kernel cache."""
     with tempfile.TemporaryDirectory() as cache:
-        return run_scene(scene, preset, options, cache)
+        return run_scene(scene, preset, seed, options, cache)
 
 
 def seconds_row(runs):
-    """Medians: whole command, each stage, what lies outside of them (imports, summary), peak memory."""
-    wall = median([run.wall for run in runs])
+    """Medians: whole command, processor time, each stage, what lies outside (imports, summary), peak memory."""
+    wall, processor = median([run.wall for run in runs]), median([run.processor for run in runs])
     stages = [median([run.stages[name][0] for run in runs]) for name in STAGES]
     outside = median([run.wall - sum(seconds for seconds, _ in run.stages.values()) for run in runs])
-    return [wall, *stages, outside, f"{median([run.peak for run in runs]):.0f}"]
+    return [wall, processor, *stages, outside, f"{median([run.peak for run in runs]):.0f}"]
 
 
 def memory_row(runs):
@@ -131,21 +148,32 @@ def memory_row(runs):
 
 
 def metrics_row(runs):
-    """What the runs found, against the ground truth; they are alike, because the seed is."""
-    metrics = runs[0].metrics
-    if metrics["ground_truth"] is None:
-        return [None] * (len(METRICS) + 1)
-    return [*_cells(metrics, METRICS), f"{metrics['edges']} ({metrics['true_edges']})"]
+    """What the runs found, against the ground truth. runs: one of each seed."""
+    if runs[0].metrics["ground_truth"] is None:
+        return [None] * len(METRICS)
+    return _cells(runs, METRICS)
 
 
 def held_out_row(runs):
-    """What the views say that were held out, whether there is a ground truth or not."""
-    return _cells(runs[0].metrics, HELD_OUT)
+    """What the views say that were held out, whether there is a ground truth or not. runs: one of each seed."""
+    return _cells(runs, HELD_OUT)
 
 
-def _cells(metrics, columns):
-    """The text of some metrics, None where there is no number. columns: {heading: (key, pattern)}."""
-    return [pattern.format(metrics[key]) if metrics[key] is not None else None for key, pattern in columns.values()]
+def _cells(runs, columns):
+    """The text of some metrics, None where there is no number: counts as a range, means of everything else.
+
+    columns: {heading: (key, pattern)}.
+    """
+    cells = []
+    for key, pattern in columns.values():
+        values = [run.metrics[key] for run in runs]
+        if None in values:
+            cells.append(None)
+        elif pattern == "{:d}":
+            cells.append("-".join(pattern.format(count) for count in sorted({min(values), max(values)})))
+        else:
+            cells.append(pattern.format(np.mean(values)))
+    return cells
 
 
 def median(values):
@@ -158,15 +186,16 @@ def parse_arguments(arguments=None):
     parser = argparse.ArgumentParser(prog="python benchmarks/pipeline.py", description=__doc__.splitlines()[0])
     parser.add_argument("--scene", type=Path, nargs="+", help="scene files (default: all in scenes/)")
     parser.add_argument("--preset", choices=("fast", "paper"), nargs="+", default=[None], help="default: the scene's")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[None], help="default: the scene's")
     parser.add_argument("--threads", type=int, default=available_threads())
     parser.add_argument("--arch", choices=("cpu", "cuda", "vulkan"), default="cpu")
-    parser.add_argument("--repeats", type=int, default=1, help="runs of each; medians are printed")
+    parser.add_argument("--repeats", type=int, default=1, help="runs with each seed; medians are printed")
     parser.add_argument("--cold", action="store_true", help="compile all kernels anew in every run")
     return parser.parse_args(arguments)
 
 
 def main(arguments=None):
-    """Measure and print. Returns {(scene, preset): runs}."""
+    """Measure and print. Returns {(scene, preset): {seed: runs}}."""
     options = parse_arguments(arguments)
     data = os.environ.get("TAICHI_EDGES_DATA")
     scenes = options.scene or sorted((ROOT / "scenes").glob("*.yaml"))
@@ -174,19 +203,25 @@ def main(arguments=None):
     found = {}
     for scene in (scene for scene in scenes if not skipped[scene]):
         for preset in options.preset:
-            found[scene.stem, preset or "its own"] = measure(scene.resolve(), preset, options)
+            runs = {seed: measure(scene.resolve(), preset, seed, options) for seed in options.seeds}
+            found[scene.stem, preset or "its own"] = runs
+    all_runs = {key: [run for runs in of_seeds.values() for run in runs] for key, of_seeds in found.items()}
+    of_each_seed = {key: [runs[0] for runs in of_seeds.values()] for key, of_seeds in found.items()}
     cache = "empty kernel cache" if options.cold else "kernels compiled before"
-    print(f"{machine_line()}\n{options.arch}, {options.threads} threads, {cache}, medians of {options.repeats} runs")
+    seeds = "" if options.seeds == [None] else f" with each of the seeds {', '.join(map(str, options.seeds))}"
+    print(
+        f"{machine_line()}\n{options.arch}, {options.threads} threads, {cache}, medians of {options.repeats} runs{seeds}"
+    )
     heads = ["scene", "preset"]
     print("\nSeconds, and peak memory of the process:\n")
-    columns = [*heads, "whole command", *STAGES, "outside stages", "peak MiB"]
-    print(table(columns, [[*key, *seconds_row(runs)] for key, runs in found.items()]))
+    columns = [*heads, "whole command", "of all threads", *STAGES, "outside stages", "peak MiB"]
+    print(table(columns, [[*key, *seconds_row(runs)] for key, runs in all_runs.items()]))
     print("\nPeak memory of each stage, MiB:\n")
-    print(table([*heads, *STAGES], [[*key, *memory_row(runs)] for key, runs in found.items()]))
-    print("\nWhat they found:\n")
-    print(table([*heads, *METRICS, "edges (true)"], [[*key, *metrics_row(runs)] for key, runs in found.items()]))
+    print(table([*heads, *STAGES], [[*key, *memory_row(runs)] for key, runs in all_runs.items()]))
+    print("\nWhat they found, means over the seeds:\n")
+    print(table([*heads, *METRICS], [[*key, *metrics_row(runs)] for key, runs in of_each_seed.items()]))
     print("\nWhat views that were held out say of it (docs/metrics.md):\n")
-    print(table([*heads, *HELD_OUT], [[*key, *held_out_row(runs)] for key, runs in found.items()]))
+    print(table([*heads, *HELD_OUT], [[*key, *held_out_row(runs)] for key, runs in of_each_seed.items()]))
     for scene, reason in skipped.items():
         if reason:
             print(f"\nSkipped {scene.stem}: {reason}")

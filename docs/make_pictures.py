@@ -2,7 +2,14 @@
 
 Panels of one view, cropped to the scene: the edge map the training saw, the oriented points coloured by cluster, and
 the edges over the view's picture. Edge maps and pictures are shown only where the run has rendered them itself. Of
-several views, as of a building, the edges alone, in full.
+several views, as of a building, the edges alone, in full. Those of the README:
+
+    python run.py scenes/demo.yaml --set source.size=800
+    python docs/make_pictures.py runs/demo demo_000 docs/images/demo.png
+    python run.py scenes/abc_00004926_images.yaml
+    python docs/make_pictures.py runs/abc_00004926_images 0_colors docs/images/abc_00004926.png
+    python run.py scenes/castle_p19.yaml
+    python docs/make_pictures.py runs/castle_p19 0006,0000 docs/images/castle_p19.png
 """
 
 import sys
@@ -22,6 +29,7 @@ from taichi_edges.views.views import read_views
 
 PANEL, WIDE_PANEL = 420, 760  # px
 MARGIN = 0.08  # of the panel, around the edges
+GAP = 24  # px between the panels of several views, whose lines would run into each other
 
 
 def crop_of(pixels, size):
@@ -53,8 +61,9 @@ def draw_views(folder, names, out):
         canvas = np.full((views.height, views.width, 3), 255, np.uint8)
         drawn = draw_edges(canvas, views.intrinsics[view] @ views.world_to_camera[view], wireframe)
         height = round(WIDE_PANEL * views.height / views.width)
-        panels.append(cv2.resize(drawn, (WIDE_PANEL, height), interpolation=cv2.INTER_AREA))
-    cv2.imwrite(str(out), np.hstack(panels))
+        panel = cv2.resize(drawn, (WIDE_PANEL, height), interpolation=cv2.INTER_AREA)
+        panels += [panel, np.full((height, GAP, 3), 255, np.uint8)]
+    cv2.imwrite(str(out), np.hstack(panels[:-1]))
 
 
 def main(folder, view_name, out):

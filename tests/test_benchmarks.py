@@ -89,13 +89,15 @@ def test_pipeline_prints_stages_and_metrics(run, tmp_path):
     scene, lost = tmp_path / "tiny.yaml", tmp_path / "lost.yaml"
     scene.write_text(SCENE + "evaluation: {held_out: 1}\n")
     lost.write_text("source: {path: /nowhere/at/all}\n")
-    text = run("benchmarks/pipeline.py", "--scene", scene, lost, "--threads", 2)
+    text = run("benchmarks/pipeline.py", "--scene", scene, lost, "--threads", 2, "--seeds", 3, 4)
     seconds, memory, found, held_out = read_tables(text)
     assert [rows[0]["scene"] for rows in (seconds, memory, found, held_out)] == ["tiny"] * 4 and len(seconds) == 1
     stages = ("prepare", "train", "cluster", "fit", "refine", "evaluate", "export")
     assert float(seconds[0]["whole command"]) > sum(float(seconds[0][stage]) for stage in stages) > 0
     assert float(seconds[0]["peak MiB"]) >= max(float(memory[0][stage]) for stage in stages) > 50
-    assert found[0]["edges (true)"].endswith("(12)") and held_out[0]["views held out"] == "1"
+    assert float(seconds[0]["of all threads"]) > 0 and "with each of the seeds 3, 4" in text
+    assert found[0]["true edges"] == "12" and held_out[0]["views held out"] == "1"
+    assert 0 <= float(found[0]["F5 %"]) <= 100
     assert 0 <= float(held_out[0]["recall of long edges %"]) <= 100
     assert "Skipped lost: source.path: /nowhere/at/all does not exist" in text
 

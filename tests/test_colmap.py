@@ -1,5 +1,6 @@
 """COLMAP projects: which model, which images, masks, points and box; and that edges come out in COLMAP's frame."""
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -331,7 +332,8 @@ def test_edges_come_out_in_the_frame_and_scale_of_colmap(part_project, tmp_path)
     assert (away.min(axis=0) < 0.3).mean() > 0.9
     views = read_views(run.path("views.npz"))
     assert all(not Path(path).is_absolute() and run.path(path).is_file() for path in views.image_paths)
-    assert "seeds.ply" in facts["files"] and any("scene box (" in text for text in told.notes)
+    found = r"scene box \(.*\) to \(.*\), taken from the input and in its units; if it is wrong, set box"
+    assert "seeds.ply" in facts["files"] and any(re.fullmatch(found, text) for text in told.notes)
     seeds = views.similarity.to_unit(into_colmap(part.edges.sample(0.05)[0]))
     paper = load_scene(tmp_path / "part.yaml", preset="paper", settings=["train.gaussians=500"])
     started = train.start_of_training(Run(paper, run.folder), views, np.random.default_rng(0)).means

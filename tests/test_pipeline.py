@@ -355,6 +355,14 @@ def test_output_is_a_summary_and_the_progress_goes_to_standard_error(finished):
     )
 
 
+def test_every_key_of_the_edges_is_documented(finished):
+    _, runs, _ = finished
+    content = json.loads((runs / "tiny/edges.json").read_text())
+    keys = {*content, *(key for edge in content["edges"] for key in edge)}
+    page = (ROOT / "docs/wireframe.md").read_text(encoding="utf-8")
+    assert len(keys) > 10 and [key for key in sorted(keys) if f"`{key}`" not in page] == []
+
+
 def test_every_stage_can_say_what_it_found():
     assert list(FINDINGS) == list(STAGES)
     fit = {"lines": 1, "curves": 2, "loop_clusters": 1, "short_clusters": 3, "degenerate_clusters": 0}
@@ -367,6 +375,8 @@ def test_every_stage_can_say_what_it_found():
     refined = {"edges": 1, "vertices": 2, **asdict(RefineCounts(duplicates=1, unsupported=2))}
     left_out = "left out: 1 duplicate, 2 edges without support in the images"
     assert FINDINGS["refine"](refined) == f"1 edge, 2 vertices; {left_out}"
+    anchored = "1 edge, 2 vertices; 2 lines anchored to edges that they meet"
+    assert FINDINGS["refine"]({"edges": 1, "vertices": 2, **asdict(RefineCounts(anchored=2))}) == anchored
 
 
 # --------------------------------------------------------------------------------------- skipping and running again

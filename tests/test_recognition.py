@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from taichi_edges.errors import UserError
+from taichi_edges.readers import READERS
 from taichi_edges.readers.recognition import recognise, recognised_source, scene_name
 from taichi_edges.scene.settings import SourceConfig
 
@@ -51,6 +52,10 @@ def test_every_layout_is_recognised(layout, tmp_path):
     if layout != "images":
         assert str(found).startswith(says)
     assert found.reader == layout.split()[0] and found.path == tmp_path / "scene"
+
+
+def test_every_reader_has_a_layout_by_which_it_is_recognised():
+    assert {layout.split()[0] for layout in LAYOUTS} == set(READERS)
 
 
 def test_photographs_in_a_folder_of_their_own_are_found(tmp_path):

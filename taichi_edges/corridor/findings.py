@@ -79,7 +79,7 @@ def describe_refine(facts: Mapping[str, Any]) -> str:
     done: list[tuple[int, str] | tuple[int, str, str]] = [
         (facts["joined"], "stroke joined to others", "strokes joined to others"),
         (facts["circles"], "circle completed", "circles completed"),
-        (facts["anchored"], "line hung up on others", "lines hung up on others"),
+        (facts["anchored"], "line anchored to edges that it meets", "lines anchored to edges that they meet"),
         (facts["lines"], "line added", "lines added"),
     ]
     changed = ", ".join(amount(*each) for each in done if each[0])

@@ -66,9 +66,7 @@ def _scene_box(run: "Run", frames: "Frames") -> "tuple[ArrayLike, str]":
         return run.config.box, "scene"
     if frames.box is not None:
         corners = " to ".join("(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in frames.box)
-        run.progress.say(
-            f"scene box {corners}, in units of the cameras, as the layout has it; the key box sets another"
-        )
+        run.progress.say(f"scene box {corners}, taken from the input and in its units; if it is wrong, set box")
         return frames.box, "reader"
     if frames.points is not None:  # a reader takes even points that fit badly rather than none
         found = f"only {amount(len(frames.points), 'good point')}" if len(frames.points) else "no points"
@@ -182,7 +180,7 @@ def _prepare_synthetic(run: "Run") -> dict[str, Any]:
         with replacing(run.path(file)) as unfinished:
             unfinished.write_bytes(cv2.imencode(".png", picture[:, :, ::-1])[1].tobytes())
     views = replace(views, image_paths=tuple(files))
-    if source.detector in ("subpixel", "onnx"):
+    if source.detector not in ("auto", "maps"):
         views = _detected_in_pictures(run, views)
     write_edges(run.path("truth.json"), part.edges, {"part": part.name})
     facts = finish_views(run, views)

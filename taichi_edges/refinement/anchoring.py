@@ -1,11 +1,11 @@
-"""Straight edges whose depth the views cannot tell, hung up on edges whose place is known.
+"""Straight edges whose depth the views cannot tell, anchored to known edges that they meet.
 
-Who walks along a façade takes its window sills from viewing planes that nearly coincide: where such an edge is in the
-images is clear, how far away it is is not. But it touches or crosses other edges, and what is known of these tells its
-depth there: each view's own straight runs of edgels that no known edge explains are given the depths of the known edges
-that they meet, the anchors. Two anchors make a line in space, further ones confirm it; a pipe in front of a cornice is
-met in the image alone, and is outvoted. Then the other views have to show the line as well, and of the lines that would
-explain the same edgels the best founded one stays.
+For cameras in a row along a façade the viewing planes of a window sill nearly coincide: the images show where the sill
+is, but not how far away. But it touches or crosses other edges, whose depth is known: each straight run of edgels in a
+view that no known edge explains is given the depths of the known edges that it meets, the anchors. Two anchors make a
+line in space, further ones confirm it. A pipe in front of a cornice meets it in the image alone, and is outvoted. Then
+the other views have to show the line as well, and of the lines that would explain the same edgels the one with most
+anchors and views stays.
 """
 
 from dataclasses import dataclass, replace
@@ -41,7 +41,7 @@ REPEAT_PX = 1.5  # in space, between lines that are parts of one
 def anchored_lines(matching, shapes):
     """Lines that meet known shapes and that the views show where these say. matching: EdgelMatching. list of Line.
 
-    What is found in one round is known in the next: a pane hangs on the frame that hangs on the wall.
+    What is found in one round is an anchor in the next: the wall for the window's frame, the frame for its pane.
     """
     if not shapes:
         return []

@@ -38,8 +38,8 @@ class RefineCounts:
     """What the refinement did.
 
     circles: arcs that became whole circles. joined: strokes that became part of others. duplicates: strokes that
-    repeated others. anchored: lines hung up on edges that they meet. lines: added between vertices. unsupported: edges
-    left out as the images do not show them.
+    repeated others. anchored: lines that got their depth from edges that they meet. lines: added between vertices.
+    unsupported: edges left out as the images do not show them.
     relations: {kind: (how many were found, how many of these were imposed)}; what those imply is not imposed again.
     """
 

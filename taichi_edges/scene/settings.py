@@ -259,7 +259,7 @@ class RefineConfig(Section):
         0.66, description="share of the edgels about an edge that lie on it; contours have half"
     )
     anchor: bool = Field(
-        False, description="hang up straight edges whose depth the views cannot tell on known ones that they meet"
+        False, description="anchor straight edges whose depth the views cannot tell to known edges that they meet"
     )
     regularise: bool = Field(
         False, description="make edges parallel, perpendicular, coplanar, coaxial, of equal radius, if images allow"
