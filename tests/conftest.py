@@ -4,7 +4,7 @@ import gc
 import os
 import subprocess
 import sys
-from functools import cache, lru_cache
+from functools import cache
 
 import numpy as np
 import pytest

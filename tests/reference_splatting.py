@@ -7,7 +7,7 @@ jump wherever the step carries a pixel over a cut.
 """
 
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import cache
 
 import numpy as np
 
