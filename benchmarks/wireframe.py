@@ -120,7 +120,7 @@ def merged(loose, views, config):
     """Strokes that continue each other are one edge."""
     matching = EdgelMatching(views)
     yardstick, seen = yardstick_of(loose.shapes, matching), partial(support_along, matching)
-    return Wireframe.loose(continued(loose.shapes, yardstick, matching.pixel, seen)[0])
+    return Wireframe.loose(continued(loose.shapes, yardstick, seen)[0])
 
 
 def extended(loose, views, config):

@@ -66,13 +66,13 @@ def test_whole_circles_close(generator):
 def test_inliers_are_those_of_each(generator):
     arcs, points, directions, _ = arcs_and_points(generator, count=200)
     cloud, batch = Cloud(points, directions, Scale(1e-3, 0.02, 0.03)), ArcBatch.of(arcs)
-    of, members, along, squared = cloud.inliers_of(batch, batch.low, batch.high)
+    found = cloud.inliers_of(batch, batch.low, batch.high)
     for number, arc in enumerate(arcs):
-        wanted = cloud.inliers(arc, arc.low, arc.high)
-        np.testing.assert_array_equal(members[of == number], wanted[0])
-        np.testing.assert_allclose(along[of == number], wanted[1], atol=ROUNDING)
-        np.testing.assert_allclose(squared[of == number], wanted[2], rtol=1e-6, atol=ROUNDING)
-        assert len(wanted[0]) > 100
+        own, wanted = found.keep(found.of == number), cloud.inliers(arc, arc.low, arc.high)
+        np.testing.assert_array_equal(own.members, wanted.members)
+        np.testing.assert_allclose(own.along, wanted.along, atol=ROUNDING)
+        np.testing.assert_allclose(own.squared, wanted.squared, rtol=1e-6, atol=ROUNDING)
+        assert len(wanted) > 100
 
 
 def test_unbroken_stretches_are_those_of_each(generator):

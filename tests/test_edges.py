@@ -578,11 +578,12 @@ def filtered(points, opacities=None, **config):
     directions = np.stack([np.arange(len(points)), np.zeros(len(points)), np.zeros(len(points))], axis=1)
     settings = FilterConfig(**{"outlier_neighbors": 0, "refine": False, **config})
     random = np.random.default_rng(0)
-    found, kept, _, counts = filter_points(points, directions, opacities, four_views(), settings, 0.5, random)
-    np.testing.assert_array_equal(found, np.asarray(points)[kept[:, 0].astype(int)])
+    found, counts = filter_points(points, directions, opacities, four_views(), settings, 0.5, random)
+    kept = found.directions[:, 0].astype(int)
+    np.testing.assert_array_equal(found.points, np.asarray(points)[kept])
     assert counts.gaussians == len(points)
     assert counts.gaussians - counts.low_opacity - counts.low_support - counts.outliers == len(found)
-    return kept[:, 0].astype(int).tolist(), counts
+    return kept.tolist(), counts
 
 
 def test_transparent_gaussians_are_left_out(taichi):

@@ -12,8 +12,13 @@ from taichi_edges.fitting.model_selection import Track, Yardstick, best_shape, m
 from taichi_edges.fitting.prices import OUTLIER, price_of
 from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
 
-NOISE, STRETCH, SPACING = 1e-3, 0.01, 0.0025  # unit-cube units, about those of a scene of 800 x 800 pixels
-YARDSTICK = Yardstick(NOISE, STRETCH)
+NOISE, PIXEL, STRETCH, SPACING = (
+    1e-3,
+    0.0025,
+    0.01,
+    0.0025,
+)  # unit-cube units, about those of a scene of 800 x 800 pixels
+YARDSTICK = Yardstick(NOISE, PIXEL)
 SEEDS = range(3)
 
 
@@ -137,7 +142,7 @@ def test_bend_counts_where_it_exceeds_the_noise(generator, noises, kind, seed):
 
 def test_same_places_are_a_line_for_a_coarse_yardstick_and_an_arc_for_a_fine_one(generator):
     track = track_of(anywhere(bow(5 * NOISE), generator), SPACING)
-    kinds = [best_shape(track, Yardstick(noise, STRETCH), 30)[0].kind for noise in (10 * NOISE, NOISE)]
+    kinds = [best_shape(track, Yardstick(noise, PIXEL), 30)[0].kind for noise in (10 * NOISE, NOISE)]
     assert kinds == ["line", "arc"]
 
 

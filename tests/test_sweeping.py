@@ -14,6 +14,7 @@ from taichi_edges.scene.settings import SceneConfig
 from taichi_edges.seeding import sweeping
 from taichi_edges.seeding.sweeping import (
     LEAST_COMPANIONS,
+    Agreements,
     SweepSeeds,
     best_seeds,
     companions_of,
@@ -234,7 +235,8 @@ def test_pixels_beside_edgels_know_the_nearest_ones_direction(taichi, generator)
     points[:5] = [[5, 5], [15, 5], [25, 5], [5, 25], [25, 25]] + generator.uniform(-0.5, 0.5, (5, 2))  # well inside
     normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     edgels = Edgels.of_views([(points, normals, np.ones(40)), (points[:5], normals[:5], np.ones(5))])
-    codes, cosines, sines = direction_maps(edgels, 36, 40)
+    maps = direction_maps(edgels, 36, 40)
+    codes, cosines, sines = maps.codes, maps.cosines, maps.sines
     for view, count in enumerate((40, 5)):
         own = edgels.points[:count].astype(float)
         pixels = np.stack(np.meshgrid(np.arange(40), np.arange(36)), axis=-1)
@@ -264,7 +266,7 @@ def test_companions_are_on_the_same_line_in_the_same_direction():
     places = np.array([[0, 0, 0], [3, 0, 0], [3, 3, 0], [20, 0, 0], [-3, 0, 0]]) * pixel
     directions = np.array([along, -along, along, along, [0, 1, 0]])
     counts = np.array([4, 5, 6, 7, 8])
-    found = companions_of(0.5 + places, directions, counts, np.full(5, pixel))
+    found = companions_of(Agreements(0.5 + places, directions, counts, np.full(5, pixel)))
     # The second is on the first one's line; the third is beside it, the fourth is far, the fifth is turned.
     assert found.tolist() == [5 - 2, 4 - 2, 0, 0, 0]
 
@@ -273,10 +275,12 @@ def test_companions_do_not_depend_on_the_chunks_nor_on_the_scale(generator, monk
     points = generator.random((400, 3)) * [0.2, 0.004, 0.004]
     directions = np.tile([1.0, 0, 0], (400, 1))
     counts, pixel = generator.integers(4, 8, 400), generator.uniform(0.001, 0.003, 400)
-    expected = companions_of(points, directions, counts, pixel)
+    given = Agreements(points, directions, counts, pixel)
+    expected = companions_of(given)
     monkeypatch.setattr(sweeping, "SEARCHED", 37)
-    np.testing.assert_array_equal(companions_of(points, directions, counts, pixel), expected)
-    np.testing.assert_array_equal(companions_of(8 * points, directions, counts, 8 * pixel), expected)
+    np.testing.assert_array_equal(companions_of(given), expected)
+    larger = replace(given, points=8 * points, pixel=8 * pixel)
+    np.testing.assert_array_equal(companions_of(larger), expected)
     assert expected.max() > 0
 
 

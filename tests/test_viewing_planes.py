@@ -207,9 +207,9 @@ def test_a_contour_is_not_steady_and_an_edge_is(taichi, generator):
     assert explained.noise_px == pytest.approx(0.05, abs=0.03)
     assert np.median(explained.steadiness[:200]) > 0.9
     assert np.median(explained.steadiness[200:]) < 0.6
-    supported, steady, _ = judge(matching, refined, FilterConfig(refine=True))
-    assert supported[:200].all() and steady[:200].mean() > 0.95
-    assert steady[200:].mean() < 0.3
+    judged = judge(matching, refined, FilterConfig(refine=True))
+    assert judged.supported[:200].all() and judged.steady[:200].mean() > 0.95
+    assert judged.steady[200:].mean() < 0.3
 
 
 def test_what_no_point_lies_on_is_unexplained(taichi, generator):
@@ -257,12 +257,12 @@ def test_filter_refines_keeps_edges_and_drops_strays(taichi, generator):
     opacities = np.full(len(means), 0.9)
     opacities[:50] = 0.1
     config = FilterConfig(refine=True, harvest=False, grow=0.0, outlier_neighbors=0)
-    points, along, explained, counts = filter_points(means, directions, opacities, views, config, 0.5, generator)
-    off = np.min([distances_to(curve, points) for curve in curves], axis=0)
+    found, counts = filter_points(means, directions, opacities, views, config, 0.5, generator)
+    off = np.min([distances_to(curve, found.points) for curve in curves], axis=0)
     assert np.median(off) < 0.1 * pixel_of(views) and (off < pixel_of(views)).mean() > 0.99
-    assert len(points) == len(along) == len(explained.steadiness) > 0.9 * (900 - 50)
+    assert len(found.points) == len(found.directions) == len(found.explained.steadiness) > 0.9 * (900 - 50)
     assert counts.gaussians == len(means) and counts.low_opacity == 50
-    assert len(points) == counts.gaussians - counts.low_opacity - counts.low_support - counts.unsteady
+    assert len(found) == counts.gaussians - counts.low_opacity - counts.low_support - counts.unsteady
 
 
 def test_harvest_finds_an_edge_that_few_views_see(taichi, generator):
@@ -279,9 +279,10 @@ def test_harvest_finds_an_edge_that_few_views_see(taichi, generator):
     for harvest in (False, True):
         config = FilterConfig(refine=True, harvest=harvest, outlier_neighbors=0)
         found[harvest] = filter_points(means, directions, np.ones(len(means)), views, config, 0.5, generator)
-    on_rare = {harvest: (distances_to(rare, result[0]) < pixel_of(views)).sum() for harvest, result in found.items()}
+    points = {harvest: trusted.points for harvest, (trusted, _) in found.items()}
+    on_rare = {harvest: (distances_to(rare, some) < pixel_of(views)).sum() for harvest, some in points.items()}
     assert on_rare[False] == 0 and on_rare[True] > 30
-    assert found[True][3].harvested > 0
+    assert found[True][1].harvested > 0
 
 
 def test_what_few_views_see_must_be_seen_from_different_directions(taichi, generator):
@@ -291,7 +292,7 @@ def test_what_few_views_see_must_be_seen_from_different_directions(taichi, gener
         matching = EdgelMatching(views_of([A], generator, noise_px=0.02, cameras=cameras, count=5))
         refined = refine_points(matching, points, along)
         assert refined.views.min() > 3
-        supported, _, _ = judge(matching, refined, config)
+        supported = judge(matching, refined, config).supported
         assert supported.mean() > 0.9 if trusted else supported.mean() < 0.1
     many = EdgelMatching(views_of([A], generator, noise_px=0.02, cameras=narrow_cameras(16), count=16))
-    assert judge(many, refine_points(many, points, along), config)[0].mean() > 0.9
+    assert judge(many, refine_points(many, points, along), config).supported.mean() > 0.9

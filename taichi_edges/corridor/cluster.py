@@ -25,22 +25,22 @@ def cluster(run):
     gaussians = Gaussians(*read_gaussians(run.path("gaussians.ply")))
     means = views.similarity.to_unit(gaussians.means.astype(np.float64))
     threshold, generator = run.config.train.edge_threshold, np.random.default_rng(run.config.seed)
-    points, directions, explained, counts = filter_points(
+    trusted, counts = filter_points(
         means, gaussians.directions(), gaussians.opacities, views, run.config.filter, threshold, generator
     )
-    if len(points) == 0:
+    if len(trusted) == 0:
         problem = f"none of {len(means)} Gaussians passed the filters ({_in_words(asdict(counts))})"
         cure = "train longer, or lower filter.min_opacity or filter.min_support"
         if run.config.filter.refine and len(views) < FEW_VIEWS * run.config.filter.min_views:
             seen = f"an edge must be seen in {run.config.filter.min_views:g} views at full strength"
             cure = f"{len(views)} views are too few, {seen}: take more, or set filter.refine: false"
         raise UserError(f"{run.path('gaussians.ply')}: {problem}; {cure}")
-    clusters = assemble(points, directions, run.config.cluster, pixel_size(views))
-    clusters, contours = without_contours(clusters, explained, views, run.config.filter)
-    labels = clusters.labels
-    write_oriented_points(run.path("points.ply"), views.similarity.to_input(points), directions, labels)
+    clusters = assemble(trusted.points, trusted.directions, run.config.cluster, pixel_size(views))
+    clusters, contours = without_contours(clusters, trusted.explained, views, run.config.filter)
+    points, labels = views.similarity.to_input(clusters.points), clusters.labels
+    write_oriented_points(run.path("points.ply"), points, clusters.directions, labels)
     write_clusters(run.path("clusters.npz"), clusters)
-    found = {"points": len(points), "clusters": int(labels.max() + 1), "unclustered": int((labels < 0).sum())}
+    found = {"points": len(points), "clusters": len(clusters.arcs), "unclustered": int((labels < 0).sum())}
     return {**asdict(counts), **found, "contours": contours}
 
 

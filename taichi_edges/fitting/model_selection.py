@@ -21,6 +21,7 @@ LEAST_BEND = 1.0  # noises that the middle of an arc is off its chord, at least
 LEAST_FLATNESS = 0.05  # of an ellipse: the shorter axis over the longer one
 LEAST_ROUND = np.radians(45.0)  # of an ellipse, to be told from other curves
 FIT_ROUNDS = 4
+STRETCH_PX = 4.0  # length of an edge on which the errors go together
 FEWEST_PLACES = 8  # on a shape, however short it is
 
 Fit = Callable[[], Line | EllipticArc | Spline | None]
@@ -28,13 +29,18 @@ Fit = Callable[[], Line | EllipticArc | Spline | None]
 
 @dataclass(frozen=True)
 class Yardstick:
-    """What counts as a difference. noise: of a place on an edge, across it. stretch: length of one observation.
+    """What counts as a difference. noise: of a place on an edge, across it. pixel: size of a pixel at the scene.
 
     Both in units of the unit cube.
     """
 
     noise: float
-    stretch: float
+    pixel: float
+
+    @property
+    def stretch(self) -> float:
+        """Length of one observation."""
+        return STRETCH_PX * self.pixel
 
 
 @dataclass(frozen=True)

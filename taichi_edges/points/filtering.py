@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from taichi_edges.arrays.columns import Columns
+from taichi_edges.evidence.explaining import Explained, explain, unexplained
 from taichi_edges.evidence.support import exclusive_support
 
 AROUND = 9  # points, itself included, over which the steadiness of a point is a median
@@ -34,32 +36,41 @@ class FilterCounts:
     outliers: int = 0
 
 
+@dataclass(frozen=True)
+class TrustedPoints(Columns):
+    """Oriented points that are left.
+
+    points, directions: (n, 3) float64, unit cube, unit vectors. explained: what edgels say about them, Explained; None
+    where they are not refined.
+    """
+
+    points: np.ndarray
+    directions: np.ndarray
+    explained: Explained | None = None
+
+
 def filter_points(means, directions, opacities, views, config, edge_threshold, generator):
     """The centres that are opaque, supported by the edge maps and not isolated; refined if the scene wants that.
 
     means: (n, 3) unit cube. directions: (n, 3) unit vectors. opacities: (n,). config: the scene's `filter` section.
     generator: numpy.random.Generator, for what is left to chance in the harvest. ti.init must have been called.
-    Returns points (m, 3) float64, directions (m, 3) float64, what edgels say about them (Explained; None where they are
-    not refined), and FilterCounts.
+    Returns TrustedPoints and FilterCounts.
     """
     opaque = np.asarray(opacities) >= config.min_opacity
     points, directions = (np.asarray(array, dtype=np.float64)[opaque] for array in (means, directions))
     if config.refine:
-        found = refined_points(points, directions, views, config, edge_threshold, generator)
-        points, directions, explained, counts = found
+        trusted, counts = refined_points(points, directions, views, config, edge_threshold, generator)
     else:
         on_edges = _on_edge_pixels(points, views, config.min_support, edge_threshold)
-        points, directions, counts = points[on_edges], directions[on_edges], {"low_support": int((~on_edges).sum())}
-        explained = None
-    inliers = statistical_inliers(points, config.outlier_neighbors, config.outlier_deviations)
+        trusted, counts = TrustedPoints(points, directions).keep(on_edges), {"low_support": int((~on_edges).sum())}
+    inliers = statistical_inliers(trusted.points, config.outlier_neighbors, config.outlier_deviations)
     counts = FilterCounts(
         gaussians=len(opaque),
         low_opacity=int((~opaque).sum()),
         **counts,
-        outliers=len(points) - len(inliers),
+        outliers=len(trusted) - len(inliers),
     )
-    explained = explained and explained.keep(inliers)
-    return points[inliers], directions[inliers], explained, counts
+    return trusted.keep(inliers), counts
 
 
 def _on_edge_pixels(points, views, least, edge_threshold):
@@ -73,9 +84,9 @@ def _on_edge_pixels(points, views, least, edge_threshold):
 
 
 def refined_points(points, directions, views, config, edge_threshold, generator):
-    """Points on the edges that the edgels of the views agree on. Arguments as for `filter_points`.
+    """TrustedPoints on the edges that the edgels of the views agree on. Arguments as for `filter_points`.
 
-    Returns points, directions, Explained and the counts of FilterCounts that this is about.
+    Returns also the counts of FilterCounts that this is about.
     """
     from taichi_edges.evidence.edgel_matching import EdgelMatching
     from taichi_edges.evidence.viewing_planes import RefinedPoints, refine_points
@@ -83,34 +94,52 @@ def refined_points(points, directions, views, config, edge_threshold, generator)
 
     matching = EdgelMatching(views, config.min_views - CONTINUED)
     found = refine_points(matching, points, directions)
-    supported, steady, _ = judge(matching, found, config)
-    refined, sizes = found.keep(steady), [len(found), supported.sum(), steady.sum()]
+    first = judge(matching, found, config)
+    refined, more = found.keep(first.steady), found.keep(slice(0))
     if config.harvest:  # what an unsteady point explains is a contour, and no edge is to be looked for in it
-        more = harvest(matching, found.keep(supported), views, config, edge_threshold, generator)
+        more = harvest(matching, found.keep(first.supported), views, config, edge_threshold, generator)
         refined = RefinedPoints.joined([refined, more])
-    sizes.append(len(refined))
+    before = len(refined)
     if config.grow:
-        least = np.full(len(refined), config.grow)
-        least[sizes[2] :] = np.minimum(config.grow, RARE * refined.support[sizes[2] :])  # what was harvested is rare
+        rare = np.minimum(config.grow, RARE * more.support)
+        least = np.concatenate([np.full(before - len(more), config.grow), rare])
         refined = grow_points(matching, refined, least)
-    supported, steady, explained = judge(matching, refined, config)
-    sizes += [len(refined), supported.sum(), steady.sum()]
-    weak, unsteady, harvested, grown, weak_later, unsteady_later = np.abs(np.diff(sizes)).tolist()
-    counts = {"low_support": weak + weak_later, "unsteady": unsteady + unsteady_later}
-    refined = refined.keep(steady)
-    counts = {**counts, "harvested": harvested, "grown": grown}
-    return refined.points, refined.directions, explained.keep(steady), counts
+    last = judge(matching, refined, config)
+    counts = {"low_support": first.weak + last.weak, "unsteady": first.unsteady + last.unsteady}
+    counts |= {"harvested": len(more), "grown": len(refined) - before}
+    return TrustedPoints(refined.points, refined.directions, last.explained).keep(last.steady), counts
+
+
+@dataclass(frozen=True)
+class Judgement(Columns):
+    """What is thought of n RefinedPoints, whose Explained is `explained`.
+
+    supported: (n,) bool, which of them have edgels of their own. steady: (n,) bool, which of these stay on them as the
+    viewpoint moves.
+    """
+
+    supported: np.ndarray
+    steady: np.ndarray
+    explained: Explained
+
+    @property
+    def weak(self):
+        """How many are not supported."""
+        return int((~self.supported).sum())
+
+    @property
+    def unsteady(self):
+        """How many are supported, but not steady."""
+        return int((self.supported & ~self.steady).sum())
 
 
 def judge(matching, refined, config):
-    """(n,) bool: which RefinedPoints have edgels of their own; and which of these stay on them as the viewpoint moves.
+    """The Judgement of RefinedPoints.
 
-    An occluding contour does not: its support comes from views that happen to look from similar directions. Steadiness
-    is a matter of an edge and not of a point, so the median of a neighbourhood decides, and leniently: there will be
-    surer evidence when the edges are known (`contours.steady_edges`). Returns also the Explained of the points.
+    An occluding contour is not steady: its support comes from views that happen to look from similar directions.
+    Steadiness is a matter of an edge and not of a point, so the median of a neighbourhood decides, and leniently: there
+    will be surer evidence when the edges are known (`contours.steady_edges`).
     """
-    from taichi_edges.evidence.explaining import explain
-
     explained = explain(matching, refined)
     apart = (refined.views >= FEW_VIEWS * config.min_views) | (
         refined.spread >= np.sin(np.radians(config.min_angle)) ** 2
@@ -121,13 +150,12 @@ def judge(matching, refined, config):
         around = cKDTree(places).query(places, min(AROUND, len(places)))[1].reshape(len(places), -1)
         typical = np.median(explained.steadiness[supported][around], axis=1)
         steady[supported] = typical >= config.min_steadiness
-    return supported, steady, explained
+    return Judgement(supported, steady, explained)
 
 
 def harvest(matching, refined, views, config, edge_threshold, generator):
     """RefinedPoints on edges that few views see, voted for by the edgels that the `refined` ones leave unexplained."""
     from taichi_edges.evidence.edgel_matching import EdgelMatching
-    from taichi_edges.evidence.explaining import unexplained
     from taichi_edges.evidence.viewing_planes import refine_points
     from taichi_edges.seeding.voting import vote_seeds
     from taichi_edges.views.drawing import draw_edge_maps
@@ -137,8 +165,7 @@ def harvest(matching, refined, views, config, edge_threshold, generator):
     seeds = vote_seeds(left, edge_threshold, generator, keep=HARVEST_KEEP)
     matching = EdgelMatching(left, matching.least_views)
     found = refine_points(matching, seeds.points, seeds.directions)
-    steady = judge(matching, found, config)[1]
-    return found.keep(steady)
+    return found.keep(judge(matching, found, config).steady)
 
 
 def statistical_inliers(points, neighbors, deviations):

@@ -249,12 +249,11 @@ def distinct(lines, matching, free):
     free: (e,) bool, the edgels that no known shape has.
     """
     sight = Sight.of(matching, lines, free, 0.5 * SPACING_PX)
-    votes, worth, rival = ballot(lines, sight, len(free))
-    elected = (votes >= LEAST_VOTES) & (worth >= LEAST_WORTH) & (worth >= rival)
+    ballot = Ballot.of(lines, sight, len(free))
     support = np.bincount(sight.lines, (sight.edgels >= 0).sum(axis=1), len(lines))
     starts = np.searchsorted(sight.lines, np.arange(len(lines) + 1))
-    owners, extents, kept = np.full(len(free), -1), lines.extents.copy(), []
-    for line in np.lexsort((-support, -worth)).tolist():
+    owners, extents, kept, elected = np.full(len(free), -1), lines.extents.copy(), [], ballot.elected
+    for line in np.lexsort((-support, -ballot.worth)).tolist():
         found = np.unique(sight.edgels[starts[line] : starts[line + 1]])
         found = found[found >= 0]
         others = owners[found]
@@ -272,27 +271,42 @@ def distinct(lines, matching, free):
     return [Line(ends[line]) for line in sorted(kept)]
 
 
-def ballot(lines, sight, count):
-    """(n,) number of views whose runs propose a line, (n,) that and how many of their ends are anchors, on average, and
-    (n,) the greatest such sum of the other lines for the same edgels.
+@dataclass(frozen=True)
+class Ballot:
+    """How well some Lines are founded.
 
     Which known edges a run happens to cross in the image changes with the viewpoint, and so does where a line through
-    these would be; what it really touches does not. And edges end where they meet others, in every view. sight: of the
-    Lines. count: of edgels.
+    these would be; what it really touches does not. And edges end where they meet others, in every view.
+    votes: (n,) number of views whose runs propose a line. worth: (n,) that and how many of their ends are anchors, on
+    average. rivals: (n,) the greatest worth of the other lines for the same edgels.
     """
-    place, view = np.nonzero(sight.edgels >= 0)
-    shape, entries = (len(lines), count), np.ones(len(place), np.int32)
-    owned = csr_matrix((entries, (sight.lines[place], sight.edgels[place, view])), shape=shape)
-    owned.data[:] = 1
-    total, common = np.asarray(owned.sum(axis=1))[:, 0], (owned @ owned.T).tocoo()
-    alike = common.data >= OVERLAP * np.minimum(total[common.row], total[common.col])
-    one, other = common.row[alike], common.col[alike]
-    same = beside(lines, one, lines.ends[other])[1] <= SAME_PX * lines.sizes[one]
-    votes = voters(one[same], lines.views[other[same]], len(lines))
-    closed = np.bincount(one[same], lines.closed[other[same]], len(lines))
-    worth, rival = votes + closed / np.maximum(np.bincount(one[same], minlength=len(lines)), 1), np.zeros(len(lines))
-    np.maximum.at(rival, one[~same], worth[other[~same]])
-    return votes, worth, rival
+
+    votes: np.ndarray
+    worth: np.ndarray
+    rivals: np.ndarray
+
+    @staticmethod
+    def of(lines, sight, count):
+        """sight: of the Lines. count: of edgels."""
+        place, view = np.nonzero(sight.edgels >= 0)
+        shape, entries = (len(lines), count), np.ones(len(place), np.int32)
+        owned = csr_matrix((entries, (sight.lines[place], sight.edgels[place, view])), shape=shape)
+        owned.data[:] = 1
+        total, common = np.asarray(owned.sum(axis=1))[:, 0], (owned @ owned.T).tocoo()
+        alike = common.data >= OVERLAP * np.minimum(total[common.row], total[common.col])
+        one, other = common.row[alike], common.col[alike]
+        same = beside(lines, one, lines.ends[other])[1] <= SAME_PX * lines.sizes[one]
+        votes = voters(one[same], lines.views[other[same]], len(lines))
+        closed = np.bincount(one[same], lines.closed[other[same]], len(lines))
+        worth = votes + closed / np.maximum(np.bincount(one[same], minlength=len(lines)), 1)
+        rivals = np.zeros(len(lines))
+        np.maximum.at(rivals, one[~same], worth[other[~same]])
+        return Ballot(votes, worth, rivals)
+
+    @property
+    def elected(self):
+        """(n,) bool: the lines that enough views propose, and that no other one for their edgels beats."""
+        return (self.votes >= LEAST_VOTES) & (self.worth >= LEAST_WORTH) & (self.worth >= self.rivals)
 
 
 def voters(lines, views, count):

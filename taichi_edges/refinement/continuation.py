@@ -5,7 +5,7 @@ smoothly form a path, and the path is cut anew into as few shapes as pay (`model
 over all ways to cut it. A stroke that lies beside others on its whole length repeats them.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from itertools import chain
 
 import numpy as np
@@ -15,7 +15,7 @@ from taichi_edges.fitting.arcs import fit_arc, through_three
 from taichi_edges.fitting.distances import distances_to, unit
 from taichi_edges.fitting.model_selection import Track, best_shape, misfit, observations, track_of
 from taichi_edges.fitting.prices import price_of
-from taichi_edges.geometry.shapes import bounds_of, near_bounds
+from taichi_edges.geometry.shapes import EllipticArc, Line, Spline, bounds_of, near_bounds
 
 BESIDE = 3.0  # noises: places so near to a shape are on it
 PARALLEL = np.cos(np.radians(20.0))
@@ -44,17 +44,28 @@ class Merging:
     joined: int = 0
     duplicates: int = 0
 
+    def __add__(self, other):
+        pairs = zip(astuple(self), astuple(other), strict=True)
+        return Merging(*(one + more for one, more in pairs))
 
-def continued(shapes, yardstick, pixel, seen, gap_px=JOINT_GAP_PX):
+
+@dataclass(frozen=True)
+class Stroke:
+    """A shape, and the Track of places by which it is compared with others."""
+
+    shape: Line | EllipticArc | Spline
+    track: Track
+
+
+def continued(shapes, yardstick, seen, gap_px=JOINT_GAP_PX):
     """The shapes after all three passes, and Merging.
 
-    shapes: list of shapes in the unit cube. yardstick: Yardstick. pixel: size of a pixel, unit-cube units. seen:
-    function of a shape and (n,) parameters that tells how many views see an edge there, (n,). gap_px: between strokes
-    that continue each other, at most.
+    shapes: list of shapes in the unit cube. yardstick: Yardstick. seen: function of a shape and (n,) parameters that
+    tells how many views see an edge there, (n,). gap_px: between strokes that continue each other, at most.
     """
-    rounded, circles = with_whole_circles(shapes, yardstick, pixel, seen)
-    chained = rejoined(rounded, yardstick, pixel, seen, gap_px)
-    single = without_repeats(chained, yardstick, pixel)
+    rounded, circles = with_whole_circles(shapes, yardstick, seen)
+    chained = rejoined(rounded, yardstick, seen, gap_px)
+    single = without_repeats(chained, yardstick)
     joined = len(shapes) - len(chained)
     return single, Merging(circles, joined, len(chained) - len(single))
 
@@ -62,14 +73,18 @@ def continued(shapes, yardstick, pixel, seen, gap_px=JOINT_GAP_PX):
 # --------------------------------------------------------------------------------------------------- whole circles
 
 
-def with_whole_circles(shapes, yardstick, pixel, seen):
+def with_whole_circles(shapes, yardstick, seen):
     """The shapes, arcs replaced by the circle they are parts of where that goes on; and how many circles that gave."""
     shapes, circles = list(shapes), []
     waiting = sorted((n for n, shape in enumerate(shapes) if shape.kind == "arc"), key=lambda n: -shapes[n].length)
     if not waiting:
         return shapes, 0
-    tracks = [track_of(shape, pixel) for shape in shapes]
-    places, gone, alive = Places(tracks), set(), np.array([not shape.closed for shape in shapes])
+    strokes = [Stroke(shape, track_of(shape, yardstick.pixel)) for shape in shapes]
+    places, gone, alive = (
+        Places([stroke.track for stroke in strokes]),
+        set(),
+        np.array([not shape.closed for shape in shapes]),
+    )
     for number in waiting:
         if number in gone:
             continue
@@ -78,11 +93,11 @@ def with_whole_circles(shapes, yardstick, pixel, seen):
         if circle is None:
             continue
         others = np.unique(places.owners[places.about(circle, BESIDE * yardstick.noise, alive)]).tolist()
-        on = {n: on_shape(circle, tracks[n], yardstick) for n in others}
+        on = {n: on_shape(circle, strokes[n].track, yardstick) for n in others}
         parts = [n for n in others if on[n].mean() >= REPEATED]
-        if number not in parts or not is_cheaper(circle, parts, shapes, tracks, yardstick):
+        if number not in parts or not is_cheaper(circle, [strokes[n] for n in parts], yardstick):
             continue
-        if goes_on(circle, np.concatenate([tracks[n].points[on[n]] for n in others]), pixel, seen, COVERED):
+        if goes_on(circle, np.concatenate([strokes[n].track.points[on[n]] for n in others]), yardstick, seen, COVERED):
             circles.append(circle)
             gone.update(parts)
     return [shape for n, shape in enumerate(shapes) if n not in gone] + circles, len(circles)
@@ -135,14 +150,14 @@ def circle_around(shape, places, alive, yardstick):
     return circle
 
 
-def goes_on(shape, places, pixel, seen, least=0.0):
+def goes_on(shape, places, yardstick, seen, least=0.0):
     """Do strokes, and the images between them, show the whole shape? places: (n, 3) points of strokes on it.
 
     least: share of the shape that the strokes must cover.
     """
-    count = max(int(np.ceil(shape.length / pixel)), 8)
+    count = max(int(np.ceil(shape.length / yardstick.pixel)), 8)
     parameters = (np.arange(count) + 0.5) / count
-    covered = cKDTree(places).query(shape.at(parameters))[0] <= SPACING_PX * pixel
+    covered = cKDTree(places).query(shape.at(parameters))[0] <= SPACING_PX * yardstick.pixel
     if covered.all() or covered.mean() < least or not covered.any():
         return bool(covered.all())
     views = seen(shape, parameters)
@@ -150,11 +165,11 @@ def goes_on(shape, places, pixel, seen, least=0.0):
     return (views[~covered] >= max(GAP_SEEN * usual, LEAST_GAP_VIEWS)).mean() >= GAP_SHOWN
 
 
-def is_cheaper(shape, parts, shapes, tracks, yardstick):
-    """Does a shape describe what its parts, indices of shapes, describe at less cost (BIC)? tracks: of all shapes."""
-    points, share = (np.concatenate([getattr(tracks[n], name) for n in parts]) for name in ("points", "share"))
+def is_cheaper(shape, parts, yardstick):
+    """Does a shape describe what its parts, Strokes, describe at less cost (BIC)?"""
+    points, share = (np.concatenate([getattr(part.track, name) for part in parts]) for name in ("points", "share"))
     price = np.log(observations(share, yardstick))
-    before = price * sum(price_of(shapes[n]) for n in parts)
+    before = price * sum(price_of(part.shape) for part in parts)
     return price * price_of(shape) + misfit(distances_to(shape, points), share, yardstick) < before
 
 
@@ -173,31 +188,31 @@ def on_shape(shape, track, yardstick):
 # ---------------------------------------------------------------------------------------------------- smooth paths
 
 
-def rejoined(shapes, yardstick, pixel, seen, gap_px=JOINT_GAP_PX):
+def rejoined(shapes, yardstick, seen, gap_px=JOINT_GAP_PX):
     """The shapes, each path of strokes that continue each other cut anew into as few as pay."""
-    whole = []
-    for path, closes in smooth_paths(shapes, yardstick, pixel, gap_px):
-        tracks = [oriented(track_of(shapes[number], SPACING_PX * pixel), backward) for number, backward in path]
-        loop = closed_shape([shapes[number] for number, _ in path], tracks, yardstick, pixel, seen) if closes else None
-        whole += [loop] if loop is not None else cut_anew([shapes[n] for n, _ in path], tracks, yardstick, pixel, seen)
+    whole, spacing = [], SPACING_PX * yardstick.pixel
+    for path, closes in smooth_paths(shapes, yardstick, gap_px):
+        strokes = [Stroke(shapes[n], oriented(track_of(shapes[n], spacing), backward)) for n, backward in path]
+        loop = closed_shape(strokes, yardstick, seen) if closes else None
+        whole += [loop] if loop is not None else cut_anew(strokes, yardstick, seen)
     return whole
 
 
-def closed_shape(parts, tracks, yardstick, pixel, seen):
-    """The closed shape of strokes that follow each other back to the first one, or None where none is cheaper."""
-    track = replace(joined_track(tracks), closed=True)
+def closed_shape(strokes, yardstick, seen):
+    """The closed shape of Strokes that follow each other back to the first one, or None where none is cheaper."""
+    track = replace(joined_track(strokes), closed=True)
     count = observations(track.share, yardstick)
-    worth = np.log(count) * sum(price_of(part) for part in parts)
+    worth = np.log(count) * sum(price_of(stroke.shape) for stroke in strokes)
     shape, _ = best_shape(track, yardstick, count, worth)
-    return shape if shape is not None and replaces(shape, tracks, yardstick, pixel, seen) else None
+    return shape if shape is not None and replaces(shape, strokes, yardstick, seen) else None
 
 
-def smooth_paths(shapes, yardstick, pixel, gap_px):
+def smooth_paths(shapes, yardstick, gap_px):
     """Lists of (index, reversed) of strokes that continue each other, and whether they come back to their start.
 
     Every shape is in one of them.
     """
-    partner = stroke_joints(shapes, yardstick, pixel, gap_px)
+    partner = stroke_joints(shapes, yardstick, gap_px)
     paths, seen = [], set()
     ends = [(number, side) for number, shape in enumerate(shapes) for side in (0, 1)]
     starts = [end for end in ends if end not in partner] + ends  # open paths first, then what goes round
@@ -214,16 +229,16 @@ def smooth_paths(shapes, yardstick, pixel, gap_px):
     return paths
 
 
-def stroke_joints(shapes, yardstick, pixel, gap_px):
+def stroke_joints(shapes, yardstick, gap_px):
     """{(shape, side): (shape, side)} of ends that continue each other, each the best for the other."""
     ends = [(number, side) for number, shape in enumerate(shapes) if not shape.closed for side in (0, 1)]
     if len(ends) < 2:
         return {}
     places = np.array([shapes[number].ends[side] for number, side in ends])
     outward = np.array([(2 * side - 1) * shapes[number].tangents(float(side)) for number, side in ends])
-    found = []
-    for i, j in sorted(cKDTree(places).query_pairs(gap_px * pixel)):
-        same = ends[i][0] == ends[j][0] and shapes[ends[i][0]].length < LEAST_LOOP * gap_px * pixel
+    found, gap = [], gap_px * yardstick.pixel
+    for i, j in sorted(cKDTree(places).query_pairs(gap)):
+        same = ends[i][0] == ends[j][0] and shapes[ends[i][0]].length < LEAST_LOOP * gap
         if same or outward[i] @ outward[j] > -JOINT_COSINE:
             continue
         step = places[j] - places[i]
@@ -231,7 +246,8 @@ def stroke_joints(shapes, yardstick, pixel, gap_px):
         aside = np.linalg.norm(step - (step @ along) * along)
         if aside <= BESIDE * yardstick.noise + JOINT_ASIDE * abs(step @ along):
             turn = np.arccos(np.clip(-outward[i] @ outward[j], -1, 1))
-            found.append((aside / yardstick.noise + turn / np.radians(5.0) + abs(step @ along) / (4 * pixel), i, j))
+            ahead = abs(step @ along) / (4 * yardstick.pixel)
+            found.append((aside / yardstick.noise + turn / np.radians(5.0) + ahead, i, j))
     partner = {}
     for _, i, j in sorted(found):
         if ends[i] not in partner and ends[j] not in partner:
@@ -239,24 +255,24 @@ def stroke_joints(shapes, yardstick, pixel, gap_px):
     return partner
 
 
-def cut_anew(parts, tracks, yardstick, pixel, seen):
-    """The shapes that describe a path with the least cost (BIC), each over a run of its strokes.
+def cut_anew(strokes, yardstick, seen):
+    """The shapes that describe a path of Strokes with the least cost (BIC), each over a run of them.
 
-    parts: the shapes of the strokes, in the order of the path. tracks: their Tracks, in its direction.
+    strokes: in the order of the path, their Tracks in its direction.
     """
-    count = observations(np.concatenate([track.share for track in tracks]), yardstick)
+    count = observations(np.concatenate([stroke.track.share for stroke in strokes]), yardstick)
     least, choice = [0.0], []
-    for last, shape in enumerate(parts):
-        best = (least[last] + price_of(shape) * np.log(count), last, shape)
+    for last, stroke in enumerate(strokes):
+        best = (least[last] + price_of(stroke.shape) * np.log(count), last, stroke.shape)
         for first in range(last - 1, max(0, last - LONGEST_RUN + 1) - 1, -1):
-            run = tracks[first : last + 1]
+            run = strokes[first : last + 1]
             worth = (best[0] - least[first]) * (1 - ROUNDING)
             shape, cost = best_shape(joined_track(run), yardstick, count, worth)
-            if shape is not None and replaces(shape, run, yardstick, pixel, seen):
+            if shape is not None and replaces(shape, run, yardstick, seen):
                 best = (least[first] + cost, first, shape)
         least.append(best[0])
         choice.append(best[1:])
-    cut, last = [], len(parts) - 1
+    cut, last = [], len(strokes) - 1
     while last >= 0:
         first, shape = choice[last]
         cut.append(shape)
@@ -264,15 +280,15 @@ def cut_anew(parts, tracks, yardstick, pixel, seen):
     return cut[::-1]
 
 
-def replaces(shape, run, yardstick, pixel, seen):
-    """Does the shape say most of what each of the Tracks of a run says, and do the images show it in between?
+def replaces(shape, strokes, yardstick, seen):
+    """Does the shape say most of what each of the Strokes says, and do the images show it in between?
 
     Without the former, a short stroke could be explained away by long ones.
     """
-    for track in run:
-        if (distances_to(shape, track.points) <= BESIDE * yardstick.noise).mean() < FOLLOWED:
+    for stroke in strokes:
+        if (distances_to(shape, stroke.track.points) <= BESIDE * yardstick.noise).mean() < FOLLOWED:
             return False
-    return goes_on(shape, np.concatenate([track.points for track in run]), pixel, seen)
+    return goes_on(shape, np.concatenate([stroke.track.points for stroke in strokes]), yardstick, seen)
 
 
 def oriented(track, backward):
@@ -283,9 +299,9 @@ def oriented(track, backward):
     return Track(track.points[::-1], length - track.arc[::-1], track.share[::-1], track.closed)
 
 
-def joined_track(tracks):
-    """One Track of several that follow each other; where they overlap, places are in the order of the path."""
-    arcs, offset, before = [], 0.0, None
+def joined_track(strokes):
+    """One Track of Strokes that follow each other; where they overlap, places are in the order of the path."""
+    tracks, arcs, offset, before = [stroke.track for stroke in strokes], [], 0.0, None
     for track in tracks:
         if before is not None:
             heading = unit(before.points[-1] - before.points[-2])
@@ -303,11 +319,11 @@ def joined_track(tracks):
 # --------------------------------------------------------------------------------------------------------- repeats
 
 
-def without_repeats(shapes, yardstick, pixel):
+def without_repeats(shapes, yardstick):
     """The shapes without those that lie beside longer ones on their whole length."""
     kept, bounds = set(), bounds_of(shapes)
     for number in sorted(range(len(shapes)), key=lambda number: -shapes[number].length):
-        track = track_of(shapes[number], pixel)
+        track = track_of(shapes[number], yardstick.pixel)
         near = kept & set(near_bounds(bounds, track.points, BESIDE * yardstick.noise).tolist())
         others = [shapes[other] for other in sorted(near)]
         if not others or beside_others(track, others, yardstick).mean() < REPEATED:

@@ -32,8 +32,13 @@ FRUGAL = 0.05  # weight of the way of an end against the distance that it leaves
 
 @dataclass(frozen=True)
 class Reach:
-    """The places within reach of one end. ways: (m,) outwards along the edge. points, tangents: (m, 3), outwards."""
+    """The places within reach of one end, side 0 or 1, of the edge of some number.
 
+    ways: (m,) outwards along the edge. points, tangents: (m, 3), outwards.
+    """
+
+    edge: int
+    side: int
     ways: np.ndarray
     points: np.ndarray
     tangents: np.ndarray
@@ -41,7 +46,7 @@ class Reach:
 
 @dataclass(frozen=True)
 class Meeting:
-    """Two ends. cost: how much it asks for, in usual errors. ways: of the ends. smooth: do they run on?"""
+    """Two ends, by number. cost: how much it asks for, in usual errors. ways: of the ends. smooth: do they run on?"""
 
     cost: float
     first: int
@@ -52,12 +57,12 @@ class Meeting:
 
 def connected(shapes, pixel):
     """The Wireframe of shapes, whose ends meet where they can. pixel: size of a pixel, unit-cube units."""
-    ends = [(number, side) for number, shape in enumerate(shapes) if not shape.closed for side in (0, 1)]
-    reaches = [reach_of(shapes[number], side, pixel) for number, side in ends]
-    groups = grouped(ends, reaches, meetings(ends, reaches, pixel), pixel)
+    open_shapes = [(number, shape) for number, shape in enumerate(shapes) if not shape.closed]
+    reaches = [reach_of(number, shape, side, pixel) for number, shape in open_shapes for side in (0, 1)]
+    groups = grouped(reaches, meetings(reaches, pixel), pixel)
     vertices = [meeting_point([(reaches[end], way) for end, way in group.items()]) for group in groups]
-    at = {ends[end]: number for number, group in enumerate(groups) for end in group}
-    vertices, contacts = with_contacts(shapes, ends, reaches, groups, np.array(vertices).reshape(-1, 3), pixel)
+    at = {(reaches[end].edge, reaches[end].side): number for number, group in enumerate(groups) for end in group}
+    vertices, contacts = with_contacts(shapes, reaches, groups, np.array(vertices).reshape(-1, 3), pixel)
     edges = []
     for number, shape in enumerate(shapes):
         own = () if shape.closed else (at[number, 0], at[number, 1])
@@ -68,13 +73,13 @@ def connected(shapes, pixel):
 # ------------------------------------------------------------------------------------------------------------ ends
 
 
-def reach_of(shape, side, pixel):
-    """The Reach of one end of a shape."""
+def reach_of(number, shape, side, pixel):
+    """The Reach of one end of a shape of some number."""
     inwards = min(REACH_PX * pixel, SHARE * shape.length)
     count = int(round(inwards / (STEP_PX * pixel)))
     ways = np.arange(-count, int(REACH_PX / STEP_PX) + 1) * STEP_PX * pixel
     points, tangents = along_end(shape, side, ways)
-    return Reach(ways, points, tangents)
+    return Reach(number, side, ways, points, tangents)
 
 
 def along_end(shape, side, ways):
@@ -91,14 +96,14 @@ def along_end(shape, side, ways):
     return shape.at(parameters) + np.maximum(ways, 0.0)[:, None] * tangents, tangents
 
 
-def meetings(ends, reaches, pixel):
+def meetings(reaches, pixel):
     """The Meetings of pairs of ends, best first."""
-    if len(ends) < 2:
+    if len(reaches) < 2:
         return []
     places = np.array([reach.points[reach.ways == 0][0] for reach in reaches])
     found = []
     for i, j in sorted(cKDTree(places).query_pairs(2 * REACH_PX * pixel)):
-        if ends[i][0] != ends[j][0]:
+        if reaches[i].edge != reaches[j].edge:
             meeting = meet(i, j, reaches[i], reaches[j], pixel)
             if meeting is not None:
                 found.append(meeting)
@@ -122,9 +127,9 @@ def meet(i, j, first, second, pixel):
     return Meeting(cost, i, j, (float(first.ways[a]), float(second.ways[b])), smooth)
 
 
-def grouped(ends, reaches, found, pixel):
-    """The ends that meet, as dicts end -> way; every end is in one of them."""
-    group_of = {end: {end: 0.0} for end in range(len(ends))}
+def grouped(reaches, found, pixel):
+    """The ends that meet, as dicts end -> way; every end is in one of them. found: their Meetings."""
+    group_of = {end: {end: 0.0} for end in range(len(reaches))}
     for meeting in found:
         first, second = group_of[meeting.first], group_of[meeting.second]
         if first is second:
@@ -133,7 +138,7 @@ def grouped(ends, reaches, found, pixel):
         for end, way in zip((meeting.first, meeting.second), meeting.ways, strict=True):
             if len(group_of[end]) == 1:
                 both[end] = way
-        if len({ends[end][0] for end in both}) < len(both) or not agree(reaches, both, pixel):
+        if len({reaches[end].edge for end in both}) < len(both) or not agree(reaches, both, pixel):
             continue
         for end in both:
             group_of[end] = both
@@ -165,11 +170,11 @@ def meeting_point(members):
 # -------------------------------------------------------------------------------------------------------- contacts
 
 
-def with_contacts(shapes, ends, reaches, groups, vertices, pixel):
+def with_contacts(shapes, reaches, groups, vertices, pixel):
     """The vertices, those of free ends moved onto an edge that they touch; and (k, 2) the contacts."""
     vertices, contacts, bounds = vertices.copy(), [], bounds_of(shapes)
     for number, group in enumerate(groups):
-        own = {ends[end][0] for end in group}
+        own = {reaches[end].edge for end in group}
         options = []
         places = reaches[next(iter(group))].points if len(group) == 1 else vertices[number : number + 1]
         for other in near_bounds(bounds, places, MEETING_PX * pixel).tolist():

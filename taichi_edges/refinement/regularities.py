@@ -113,6 +113,21 @@ class Linear:
     unknowns: np.ndarray
 
 
+@dataclass(frozen=True)
+class PrincipalAxes:
+    """The values of a Linear relation on the axes (m, m) on which their errors are independent.
+
+    off: (m,) values there. variances: (m,) and free: (m,) bool, whether they are more than 0: others are implied.
+    reach: (size, m) covariances of all unknowns with the values.
+    """
+
+    off: np.ndarray
+    variances: np.ndarray
+    free: np.ndarray
+    axes: np.ndarray
+    reach: np.ndarray
+
+
 class Judge:
     """What is known of the edges: linear, with a covariance, and with what has been imposed so far.
 
@@ -163,27 +178,27 @@ class Judge:
 
     def rise(self, linear):
         """Rise of the sum of squares for each unknown that a relation takes away; 0 where it is implied."""
-        off, powers, free, _, _ = self._axes(linear)
+        found = self._axes(linear)
+        off, free = found.off, found.free
         if (np.abs(off[~free]) > CLOSE).any():
             return np.inf
-        return float((off[free] ** 2 / powers[free]).sum() / max(free.sum(), 1))
+        return float((off[free] ** 2 / found.variances[free]).sum() / max(free.sum(), 1))
 
     def impose(self, linear):
         """Take a relation for granted. Returns whether it was not implied already."""
-        off, powers, free, axes, reach = self._axes(linear)
-        gain = reach @ (axes[:, free] / powers[free])
-        self.shift -= gain @ off[free]
-        self.covariance -= gain @ (reach @ axes[:, free]).T
+        found = self._axes(linear)
+        free, axes = found.free, found.axes[:, found.free]
+        gain = found.reach @ (axes / found.variances[free])
+        self.shift -= gain @ found.off[free]
+        self.covariance -= gain @ (found.reach @ axes).T
         return bool(free.any())
 
     def _axes(self, linear):
-        """The values on their principal axes, variances there, whether these are more than 0, the axes (m, m); and
-        covariances (size, m) of all unknowns with the values.
-        """
+        """The PrincipalAxes of a Linear relation, by what is known so far."""
         reach = self.covariance[:, linear.unknowns] @ linear.slopes.T
-        powers, axes = np.linalg.eigh(linear.slopes @ reach[linear.unknowns])
+        variances, axes = np.linalg.eigh(linear.slopes @ reach[linear.unknowns])
         off = axes.T @ (linear.values + linear.slopes @ self.shift[linear.unknowns])
-        return off, powers, powers > IMPLIED**2, axes, reach
+        return PrincipalAxes(off, variances, variances > IMPLIED**2, axes, reach)
 
 
 def _risen(before, after, relations):

@@ -1,6 +1,6 @@
 """From single edges to a wireframe: connected, minimal, in agreement with the images."""
 
-from dataclasses import asdict, astuple, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -19,13 +19,12 @@ from taichi_edges.fitting.model_selection import Yardstick
 from taichi_edges.refinement.adjustment import adjusted
 from taichi_edges.refinement.anchoring import anchored_lines
 from taichi_edges.refinement.completion import completed
-from taichi_edges.refinement.continuation import Merging, continued
+from taichi_edges.refinement.continuation import continued
 from taichi_edges.refinement.extents import all_extended
 from taichi_edges.refinement.junctions import connected
 from taichi_edges.refinement.regularities import found_relations, regularised
 
 NOISE_PX = 0.2  # by which an edge is off its shape, beyond the noise: next to other edges every detector is biased
-STRETCH_PX = 4.0  # length of an edge on which the errors go together
 LEAST_LENGTH_PX = 0.1  # of a stroke; a shorter one has no direction
 WIDE_GAP_PX = 24.0  # between strokes that continue each other, where their ends are still free after the first pass
 MOST_COMPARED = 150  # edges whose relations are counted where nobody asked for them: there are as many as its square
@@ -62,35 +61,34 @@ def refine_wireframe(loose, views, config):
         return loose, RefineCounts()
     matching = EdgelMatching(views, config.min_views)
     strokes = [shape for shape in loose.shapes if shape.length >= LEAST_LENGTH_PX * matching.pixel]
-    shapes, merging, unsupported = whole_edges(strokes, matching, config)
+    shapes, counts = whole_edges(strokes, matching, config)
     anchored = anchored_lines(matching, shapes) if config.anchor else []
     wireframe, lines = completed(connected([*shapes, *anchored], matching.pixel), matching)
     wireframe, relations = related(adjusted(wireframe, matching), matching, config.regularise)
     judged = with_evidence(wireframe, matching, config)
-    unsupported += len(wireframe) - len(judged)
-    added = {"anchored": len(anchored), "lines": lines}
-    return judged, RefineCounts(**asdict(merging), **added, unsupported=unsupported, relations=relations)
+    unsupported = counts.unsupported + len(wireframe) - len(judged)
+    counts = replace(counts, anchored=len(anchored), lines=lines, unsupported=unsupported, relations=relations)
+    return judged, counts
 
 
 def whole_edges(shapes, matching, config):
-    """The shapes of whole edges from those of strokes, Merging, and how many were left out for lack of support.
+    """The shapes of whole edges from those of strokes, and RefineCounts of what that took.
 
     Free ends are extended only when it is known which are free, and then some more strokes continue each other.
     """
-    pixel, seen = matching.pixel, partial(support_along, matching)
-    yardstick = yardstick_of(shapes, matching)
-    shapes, first = continued(shapes, yardstick, pixel, seen)
+    yardstick, seen = yardstick_of(shapes, matching), partial(support_along, matching)
+    shapes, first = continued(shapes, yardstick, seen)
     kept = with_support(matching, shapes, config)
-    longer, second = continued(with_longer_ends(matching, kept), yardstick, pixel, seen, WIDE_GAP_PX)
+    longer, second = continued(with_longer_ends(matching, kept), yardstick, seen, WIDE_GAP_PX)
     found = with_support(matching, longer, config)
-    merging = Merging(*(sum(pair) for pair in zip(astuple(first), astuple(second), strict=True)))
-    return found, merging, len(shapes) - len(kept) + len(longer) - len(found)
+    unsupported = len(shapes) - len(kept) + len(longer) - len(found)
+    return found, RefineCounts(**asdict(first + second), unsupported=unsupported)
 
 
 def yardstick_of(shapes, matching):
     """The Yardstick of strokes: the noise of their edgels, and by how much edges are off beyond it."""
     noise = np.hypot(NOISE_PX, support_of(matching, shapes).noise_px)
-    return Yardstick(noise * matching.pixel, STRETCH_PX * matching.pixel)
+    return Yardstick(noise * matching.pixel, matching.pixel)
 
 
 def related(wireframe, matching, impose):

@@ -15,6 +15,7 @@ import numpy as np
 import taichi as ti
 from scipy.spatial import cKDTree
 
+from taichi_edges.arrays.columns import Columns
 from taichi_edges.detectors.chains import chain_lengths
 from taichi_edges.kernels.device import download, upload
 from taichi_edges.kernels.points import F32_1D, F32_2D, I32_1D, I32_2D, U8_3D
@@ -49,16 +50,29 @@ MARGIN = 2.0  # times the seeds that there is room for: some are false
 SIGHTED = 2000  # seeds that tell how many views see a place
 
 OnDevice = np.ndarray | ti.Ndarray
-DirectionMaps = tuple[OnDevice, OnDevice, OnDevice]  # see `direction_maps`
+
+
+@dataclass(frozen=True)
+class Agreements(Columns):
+    """Places on the rays of edgels where the neighbours of their views agree on the direction of an edge.
+
+    points, directions: (n, 3) unit cube. views: (n,) that agree, the reference included. pixel: (n,) size of a pixel at
+    each point, unit-cube units.
+    """
+
+    points: np.ndarray
+    directions: np.ndarray
+    views: np.ndarray
+    pixel: np.ndarray
+
+
+NOWHERE = Agreements(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int), np.zeros(0))
 
 
 @dataclass(frozen=True)
 class SweepSeeds:
-    """Places on the rays of edgels where the neighbours of their views agree on the direction of an edge.
-
-    points, directions: (n, 3) unit cube. views: (n,) that agree, the reference included. companions: (n,) see
-    `companions_of`. pixel: (n,) size of a pixel at each point, unit-cube units. references: edgels whose rays were
-    swept.
+    """Agreements (points to pixel) of all views. companions: (n,) see `companions_of`. references: edgels whose rays
+    were swept.
     """
 
     points: np.ndarray
@@ -191,11 +205,17 @@ def count_in(tally, b):
     return ti.cast(tally >> ti.cast(4 * b, ti.u64) & ti.u64(15), ti.i32)
 
 
-def direction_maps(edgels: "Edgels", height: int, width: int) -> DirectionMaps:
-    """(V, H, W) uint8 codes of directions of Edgels, see `stamp_directions`; cosines and sines (CODES + 1,) of codes.
+@dataclass(frozen=True)
+class DirectionMaps:
+    """On the device. codes: (V, H, W) uint8, of directions, see `stamp_directions`. cosines, sines: (CODES + 1,)."""
 
-    All on the device. height, width: pixels.
-    """
+    codes: OnDevice
+    cosines: OnDevice
+    sines: OnDevice
+
+
+def direction_maps(edgels: "Edgels", height: int, width: int) -> DirectionMaps:
+    """The DirectionMaps of Edgels. height, width: pixels."""
     angles = np.arctan2(edgels.normals[:, 1], edgels.normals[:, 0]) % np.pi
     code = np.minimum(np.floor(angles / np.pi * CODES), CODES - 1) + 1
     elements = np.column_stack([edgels.points, code]).astype(np.float32)
@@ -206,7 +226,8 @@ def direction_maps(edgels: "Edgels", height: int, width: int) -> DirectionMaps:
         size = min(batch, edgels.view_count - first)
         stamp_directions(first, starts, elements, upload(np.full((size, height, width), 255, np.uint8)), codes)
     middles = (np.arange(-1, CODES) + 0.5) / CODES * np.pi
-    return codes, upload(np.cos(middles).astype(np.float32)), upload(np.sin(middles).astype(np.float32))
+    cosines, sines = (upload(of(middles).astype(np.float32)) for of in (np.cos, np.sin))
+    return DirectionMaps(codes, cosines, sines)
 
 
 def neighbor_views(views: Views) -> list[np.ndarray]:
@@ -253,12 +274,10 @@ def camera_centres(views: Views) -> np.ndarray:
     return -np.einsum("vji,vj->vi", rotations, offsets)
 
 
-def sweep_view(
-    views: Views, view: int, chosen: np.ndarray, others: np.ndarray, maps: DirectionMaps
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Candidate points and directions (k, 3), counts of views (k,) and pixel sizes (k,) of the chosen edgels of a view.
+def sweep_view(views: Views, view: int, chosen: np.ndarray, others: np.ndarray, maps: DirectionMaps) -> Agreements:
+    """Agreements on the rays of the chosen edgels of a view.
 
-    chosen: (m,) bool, of its edgels. others: indices of its neighbours, at least TOGETHER. maps: `direction_maps`.
+    chosen: (m,) bool, of its edgels. others: indices of its neighbours, at least TOGETHER. maps: DirectionMaps.
     The step in inverse depth is that of STEP_PX along the epipolar line of the farthest neighbour: 1 / NEAR of it
     are far fewer than the 2^31 / ANGLES that a candidate can tell.
     """
@@ -278,7 +297,7 @@ def sweep_view(
     near = np.maximum(near, max(SWEPT_FROM, np.sort(baselines)[TOGETHER - 1] / np.tan(MOST_ANGLE)))
     good = far > near
     if not good.any():
-        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int), np.zeros(0)
+        return NOWHERE
     rays, planes, near, far = rays[good], planes[good], near[good], far[good]
     projections = views.intrinsics[others] @ views.world_to_camera[others]
     epipoles = projections @ np.append(centre, 1.0)
@@ -287,8 +306,8 @@ def sweep_view(
     counts = upload(np.zeros((len(rays), CANDIDATES), np.int32))
     f32 = [upload(np.ascontiguousarray(a, np.float32)) for a in (rays, planes, np.column_stack([1 / far, 1 / near]))]
     pair = upload(epipoles.astype(np.float32)), upload(projections[:, :, :3].reshape(-1, 9).astype(np.float32))
-    codes, cosines, sines = maps
-    sweep_rays(*f32, step, *pair, upload(others.astype(np.int32)), codes, cosines, sines, TOGETHER, found, counts)
+    tables = upload(others.astype(np.int32)), maps.codes, maps.cosines, maps.sines
+    sweep_rays(*f32, step, *pair, *tables, TOGETHER, found, counts)
     found, counts = download(found), download(counts)
     which, slot = np.nonzero(counts >= TOGETHER)
     inverse = 1 / far[which] + (found[which, slot] // ANGLES) * step
@@ -296,7 +315,8 @@ def sweep_view(
     e1 = rays[which] / np.linalg.norm(rays[which], axis=1, keepdims=True)
     e2 = np.cross(planes[which], e1)
     directions = np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2
-    return centre + rays[which] / inverse[:, None], directions, counts[which, slot] + 1, 1 / (inverse * lens[0, 0])
+    points, pixel = centre + rays[which] / inverse[:, None], 1 / (inverse * lens[0, 0])
+    return Agreements(points, directions, counts[which, slot] + 1, pixel)
 
 
 def through_box(origin: np.ndarray, rays: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -327,24 +347,25 @@ def sweep_seeds(views: Views, report: Callable[[int], None] | None = None) -> Sw
     assert edgels is not None
     maps = direction_maps(edgels, views.height, views.width)
     chosen = references(edgels, chain_lengths(edgels))
-    parts = [(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int), np.zeros(0))]
+    parts = [NOWHERE]
     for view, others in enumerate(neighbor_views(views)):
         some = chosen[edgels.starts[view] : edgels.starts[view + 1]]
         if len(others) >= TOGETHER and some.any():
             parts.append(sweep_view(views, view, some, others, maps))
         if report is not None:
             report(view + 1)
-    points, directions, counts, pixel = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    companions = companions_of(points, directions, counts, pixel)
-    return SweepSeeds(points, directions, counts, companions, pixel, int(chosen.sum()))
+    found = Agreements.joined(parts)
+    companions = companions_of(found)
+    return SweepSeeds(found.points, found.directions, found.views, companions, found.pixel, int(chosen.sum()))
 
 
-def companions_of(points: np.ndarray, directions: np.ndarray, counts: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-    """(n,) how many views more than chance's agree on candidates nearby on the same line, for each candidate.
+def companions_of(found: Agreements) -> np.ndarray:
+    """(n,) of each of the Agreements: how many views more than chance's agree on others nearby on the same line.
 
-    points, directions: (n, 3) unit cube. counts: (n,) views that agree on each; two always do. pixel: (n,) unit-cube
-    units. What is nearby is a matter of pixels at the candidate, and is looked for among those of about its pixel size.
+    Two views always agree. What is nearby is a matter of pixels at the place, and is looked for among those of about
+    its pixel size.
     """
+    points, directions, pixel = found.points, found.directions, found.pixel
     companions = np.zeros(len(points), int)
     octaves = np.floor(np.log2(pixel)).astype(int)
     for octave in np.unique(octaves):
@@ -359,7 +380,7 @@ def companions_of(points: np.ndarray, directions: np.ndarray, counts: np.ndarray
             across = np.linalg.norm(apart - (apart * direction).sum(axis=1)[:, None] * direction, axis=1)
             aligned = np.abs((direction * directions[other]).sum(axis=1)) >= ALIGNED
             same = (one != other) & aligned & (across <= ASIDE_PX * pixel[one])
-            np.add.at(companions, one[same], counts[other[same]] - 2)
+            np.add.at(companions, one[same], found.views[other[same]] - 2)
     return companions
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from taichi_edges.arrays.columns import Columns
 from taichi_edges.arrays.ranges import ragged
 from taichi_edges.fitting.arc_batch import ArcBatch, fit_batch
 
@@ -44,6 +45,20 @@ class Scale:
         return float(np.cos(np.clip(self.spread * max(DIRECTION_NOISES * self.turn, TURNS[0]), *TURNS)))
 
 
+@dataclass(frozen=True)
+class Inliers(Columns):
+    """Points on a line or an arc, or on several.
+
+    members: (n,) indices of the points. along: (n,) their arc lengths. squared: (n,) squared residuals, noises. of:
+    (n,) number of the arc, ascending; None where there is but one.
+    """
+
+    members: np.ndarray
+    along: np.ndarray
+    squared: np.ndarray
+    of: np.ndarray | None = None
+
+
 class Cloud:
     """Oriented points in a search tree: points, directions (n, 3), scale: Scale."""
 
@@ -72,7 +87,7 @@ class Cloud:
         return np.unique(np.fromiter(itertools.chain.from_iterable(found), np.int64))
 
     def inliers(self, arc, low, high, tolerance=INLIER):
-        """Indices, arc lengths and squared residuals (noises) of the points on the arc between two arc lengths.
+        """The Inliers of an Arc between two arc lengths.
 
         tolerance: noises that they may be off.
         """
@@ -81,18 +96,18 @@ class Cloud:
         squared = (offsets**2).sum(axis=1) / self.scale.noise**2
         agree = np.abs((self.directions[around] * arc.tangents(along)).sum(axis=1)) >= self.scale.cosine
         good = (squared <= tolerance**2) & agree & (along >= low) & (along <= high)
-        return around[good], along[good], squared[good]
+        return Inliers(around[good], along[good], squared[good])
 
     def inliers_of(self, arcs, low, high):
-        """The same for an ArcBatch, with the numbers of the arcs before it: four arrays (t,), arc after arc."""
+        """The Inliers of the arcs of an ArcBatch, arc after arc, each between two arc lengths, (m,)."""
         of, around = self._near_each(arcs, low, high)
         stretched = ArcBatch(arcs.origin, arcs.tangent, arcs.bend, low, high, arcs.closed)
         along, offsets = stretched.coordinates(self.points[around], of)
         squared = (offsets**2).sum(axis=1) / self.scale.noise**2
         good = (squared <= INLIER**2) & (along >= low[of]) & (along <= high[of])
-        of, around, along, squared = of[good], around[good], along[good], squared[good]
-        agree = np.abs((self.directions[around] * arcs.tangents(along, of)).sum(axis=1)) >= self.scale.cosine
-        return of[agree], around[agree], along[agree], squared[agree]
+        on = Inliers(around, along, squared, of).keep(good)
+        agree = np.abs((self.directions[on.members] * arcs.tangents(on.along, on.of)).sum(axis=1)) >= self.scale.cosine
+        return on.keep(agree)
 
     def _near_each(self, arcs, low, high):
         """Numbers of the arcs, and indices of the points about them, (t,); some farther ones are among them."""
@@ -113,23 +128,22 @@ def grow_arcs(cloud, arcs, straight):
     scale, best, found, active = cloud.scale, arcs, np.zeros(len(arcs), bool), np.arange(len(arcs))
     for _ in range(GROWTH_ROUNDS if len(arcs) else 0):
         ahead = np.maximum(GROWTH * arcs.length, INLIER * scale.noise)
-        of, members, along, _ = cloud.inliers_of(arcs, arcs.low - ahead, arcs.high + ahead)
-        inside = all_unbroken(of, along, arcs.low, arcs.high, np.minimum(ahead, scale.gap))
-        enough = np.bincount(of[inside], minlength=len(arcs)) >= START_POINTS
-        inside &= enough[of]
-        of, members, along = (np.cumsum(enough) - 1)[of[inside]], members[inside], along[inside]
-        arcs, active = arcs.keep(enough), active[enough]
+        on = cloud.inliers_of(arcs, arcs.low - ahead, arcs.high + ahead)
+        inside = all_unbroken(on.of, on.along, arcs.low, arcs.high, np.minimum(ahead, scale.gap))
+        enough = np.bincount(on.of[inside], minlength=len(arcs)) >= START_POINTS
+        on = on.keep(inside & enough[on.of])
+        of, arcs, active = (np.cumsum(enough) - 1)[on.of], arcs.keep(enough), active[enough]
         if not len(arcs):
             break
         before, starts = arcs.length, np.searchsorted(of, np.arange(len(arcs)))
-        arcs = arcs.over(np.minimum.reduceat(along, starts), np.maximum.reduceat(along, starts))
+        arcs = arcs.over(np.minimum.reduceat(on.along, starts), np.maximum.reduceat(on.along, starts))
         arcs = arcs.over(arcs.low, np.where(arcs.length + scale.gap >= arcs.round, arcs.low + arcs.round, arcs.high))
-        places, directions, none = cloud.points[members], cloud.directions[members], np.zeros(len(arcs))
+        places, directions, none = cloud.points[on.members], cloud.directions[on.members], np.zeros(len(arcs))
         arcs = fit_batch(arcs.recentred(), places, directions, of, none, INLIER * scale.noise, straight, 1)
         best = best.put(active, arcs)
-        on = ~found[active] | (arcs.length > GROWN * before)
+        grows = ~found[active] | (arcs.length > GROWN * before)
         found[active] = True
-        arcs, active = arcs.keep(on), active[on]
+        arcs, active = arcs.keep(grows), active[grows]
     return best, found
 
 
@@ -177,8 +191,8 @@ def grown_from_seeds(cloud, neighbors, seeds):
     rich = np.flatnonzero([len(neighbors[seed]) >= START_POINTS - 1 for seed in seeds])
     starts, of, members = from_neighbors(cloud, neighbors, seeds[rich])
     grown, found = refitted(cloud, starts, of, members, straight=True)
-    on = cloud.inliers_of(grown.keep(found), grown.low[found], grown.high[found])[:2]
-    bent = refitted(cloud, grown.keep(found), *on, straight=False)
+    on = cloud.inliers_of(grown.keep(found), grown.low[found], grown.high[found])
+    bent = refitted(cloud, grown.keep(found), on.of, on.members, straight=False)
     without = ~found[of]
     of, members = (np.cumsum(~found) - 1)[of[without]], members[without]
     rest = refitted(cloud, starts.keep(~found), of, members, straight=False)

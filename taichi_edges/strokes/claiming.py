@@ -8,13 +8,14 @@ that remain are the other edges. Points at a contact are claimed by one and shar
 
 import heapq
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from taichi_edges.fitting.arc_batch import ArcBatch
 from taichi_edges.fitting.arcs import Arc, fit_arc
 from taichi_edges.fitting.prices import price_of_arc
-from taichi_edges.strokes.arc_growth import INLIER, grown_from_seeds, unbroken
+from taichi_edges.strokes.arc_growth import INLIER, Inliers, grown_from_seeds, unbroken
 
 OUTLIER = INLIER**2  # squared noises: what a point on an edge brings at most
 OWN_SHARE = 0.5  # of the points along a stretch, which must be an arc's own: elsewhere it repeats another
@@ -25,6 +26,14 @@ LEAST_AT_ONCE, MOST_AT_ONCE = 16, 512  # seeds from which arcs are grown togethe
 USED = 0.7  # of the arcs of one such batch, for the next to be larger
 WINDOW = 8192  # seeds among which these are looked for
 TAIL = 0.7  # of the gap: an edge goes on past its sharp points in steps of that size at most
+
+
+@dataclass(frozen=True)
+class Grown:
+    """An arc that was grown from a seed, and the Inliers on its whole length."""
+
+    arc: Arc
+    inliers: Inliers
 
 
 @dataclass(frozen=True)
@@ -74,15 +83,15 @@ def claims(cloud, neighbors, seeds, min_points):
 def claim_round(cloud, neighbors, seeds, min_points, ledger, found):
     """Add to the Claims in `found`, and to the Ledger, what can be claimed at the cloud's scale."""
     waiting, owner = [], ledger.owner
-    for number, (gain, *candidate) in enumerate(arc_candidates(cloud, neighbors, seeds, min_points, owner)):
-        heapq.heappush(waiting, (-gain, number, *candidate))
+    for number, (gain, candidate) in enumerate(arc_candidates(cloud, neighbors, seeds, min_points, owner)):
+        heapq.heappush(waiting, (-gain, number, candidate))
     while waiting:
-        _, number, *candidate = heapq.heappop(waiting)
-        gain, claim = supported(cloud, *candidate, owner, min_points)
+        _, number, candidate = heapq.heappop(waiting)
+        gain, claim = supported(cloud, candidate, owner, min_points)
         if gain <= 0:
             continue
         if waiting and gain < -waiting[0][0]:  # others have claimed its points: let it wait for its new turn
-            heapq.heappush(waiting, (-gain, number, *candidate))
+            heapq.heappush(waiting, (-gain, number, candidate))
             continue
         ledger.enter(claim.own, len(found), cloud.scale.noise)
         found.append(claim)
@@ -95,9 +104,9 @@ def widened(cloud, claim, ledger, number, beyond):
     """
     arc = claim.arc
     reach = 0.0 if arc.closed else cloud.scale.gap * (beyond > 0)
-    members, along, _ = cloud.inliers(arc, arc.low - reach, arc.high + reach)
-    free = ledger.owner[members] < 0
-    members, along = members[free], along[free]
+    on = cloud.inliers(arc, arc.low - reach, arc.high + reach)
+    on = on.keep(ledger.owner[on.members] < 0)
+    members, along = on.members, on.along
     if beyond and not arc.closed and len(members):
         stations = np.concatenate([along, np.linspace(arc.low, arc.high, int(arc.length / beyond) + 2)])
         good = unbroken(stations, arc.low, arc.high, beyond)[: len(along)]
@@ -120,23 +129,20 @@ def refined(cloud, claim, ledger):
 
 
 def arc_candidates(cloud, neighbors, seeds, min_points, owner):
-    """Gains, Arcs and `Cloud.inliers` of these: grown from seeds until every point that nobody owns is on one.
-
-    Or has grown none.
-    """
+    """Gains and Grown, one seed after the other until every point that nobody owns is on an arc, or has grown none."""
     covered = owner >= 0
     for seed, grown in grown_pairs(cloud, neighbors, seeds, covered):
         covered[seed] = True
-        gains = [supported(cloud, arc, inliers, owner, min_points)[0] for arc, inliers in grown]
-        for (arc, inliers), gain in zip(grown, gains, strict=True):
+        gains = [supported(cloud, candidate, owner, min_points)[0] for candidate in grown]
+        for candidate, gain in zip(grown, gains, strict=True):
             if gain == max(gains):  # even where it is too short to be claimed: its points will not do better
-                covered[inliers[0]] = True
+                covered[candidate.inliers.members] = True
             if gain > 0:
-                yield gain, arc, inliers
+                yield gain, candidate
 
 
 def grown_pairs(cloud, neighbors, seeds, covered):
-    """(seed, [(Arc, its `Cloud.inliers`)]) of one seed after the other that is not covered when its turn comes.
+    """(seed, list of its Grown) of one seed after the other that is not covered when its turn comes.
 
     covered: (n,) bool, which changes meanwhile. Arcs of seeds that are covered by then are dropped; where that were
     many, fewer are grown at once the next time.
@@ -147,33 +153,31 @@ def grown_pairs(cloud, neighbors, seeds, covered):
         first = int(waiting[-1]) + 1 if len(waiting) == count else first + WINDOW
         some = seeds[waiting]
         pairs = [[arc for arc in pair if arc is not None] for pair in grown_from_seeds(cloud, neighbors, some)]
-        inliers = iter(inliers_of_each(cloud, [arc for pair in pairs for arc in pair]))
-        used = 0
+        grown_all, used = iter(with_inliers(cloud, [arc for pair in pairs for arc in pair])), 0
         for seed, pair in zip(some.tolist(), pairs, strict=True):
-            grown = [(arc, next(inliers)) for arc in pair]
+            grown = [next(grown_all) for _ in pair]
             if not covered[seed]:
                 used += 1
                 yield seed, grown
         count = min(2 * count, MOST_AT_ONCE) if used >= USED * len(some) else max(count // 2, LEAST_AT_ONCE)
 
 
-def inliers_of_each(cloud, arcs):
-    """`Cloud.inliers` of each of some Arcs on its whole length, a list."""
+def with_inliers(cloud, arcs):
+    """A list of Grown from Arcs."""
     if not arcs:
         return []
     batch = ArcBatch.of(arcs)
-    of, *columns = cloud.inliers_of(batch, batch.low, batch.high)
-    bounds = np.searchsorted(of, np.arange(1, len(arcs)))
-    return list(zip(*(np.split(column, bounds) for column in columns), strict=True))
+    on = cloud.inliers_of(batch, batch.low, batch.high)
+    bounds = np.searchsorted(on.of, np.arange(len(arcs) + 1)).tolist()
+    return [Grown(arc, on.keep(slice(*part))) for arc, part in zip(arcs, pairwise(bounds), strict=True)]
 
 
-def supported(cloud, arc, inliers, owner, min_points):
-    """What an arc gains by the points that nobody owns, net of its price; and its Claim on them.
+def supported(cloud, candidate, owner, min_points):
+    """What a Grown arc gains by the points that nobody owns, net of its price; and its Claim on them.
 
-    inliers: `Cloud.inliers` of the arc on its whole length. A stretch counts where most points along it are its own.
-    Shared points carry it across a contact, no farther.
+    A stretch counts where most points along it are its own. Shared points carry it across a contact, no farther.
     """
-    members, along, squared = inliers
+    arc, members, along = candidate.arc, candidate.inliers.members, candidate.inliers.along
     own = owner[members] < 0
     if own.sum() < min_points:
         return 0.0, None
@@ -183,7 +187,7 @@ def supported(cloud, arc, inliers, owner, min_points):
         return 0.0, None
     if own.sum() * cloud.scale.gap < LEAST_DENSITY * np.ptp(along[own]):
         return 0.0, None
-    gain = (OUTLIER - squared[own]).sum() - price_of_arc(arc) * np.log(len(members))
+    gain = (OUTLIER - candidate.inliers.squared[own]).sum() - price_of_arc(arc) * np.log(len(members))
     whole = arc if arc.closed and own.mean() >= OWN_SHARE else arc.over(along[kept].min(), along[kept].max())
     return gain, Claim(whole, members[own], members[kept & ~own])
 

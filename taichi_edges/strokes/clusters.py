@@ -66,6 +66,7 @@ def read_clusters(path: Path) -> Clusters:
         raise UserError(f"{path}: {problem}; run again with --stage cluster") from error
 
 
+# Its arrays tell the kind, and the shape of a row, of each array in a file.
 NO_POINTS = Clusters.of(*np.zeros((2, 0, 3)), np.zeros(0, np.int64))
 
 

@@ -69,6 +69,19 @@ class Piece:
         return self.along * scale, np.array([0.0, len(self.curves)]) * scale
 
 
+@dataclass(frozen=True)
+class End:
+    """One end of a Piece, side 0 or 1."""
+
+    piece: Piece
+    side: int
+
+    def ways(self):
+        """Arc lengths of the piece's points, see `Piece.lengths`, counted outwards from this end."""
+        along, ends = self.piece.lengths()
+        return (along - ends[self.side]) * (1 if self.side else -1)
+
+
 def merged(cloud, claims, noises):
     """Pieces of whole edges from Claims, see `claiming`.
 
@@ -82,7 +95,7 @@ def merged(cloud, claims, noises):
         for number in some:
             ends.add(number, pieces[number])
         for a, b in piece_joints(cloud, pieces, ends, some):
-            gain, piece = joined(cloud, pieces[a[0]], pieces[b[0]], a[1], b[1])
+            gain, piece = joined(cloud, End(pieces[a[0]], a[1]), End(pieces[b[0]], b[1]))
             if gain > 0:
                 heapq.heappush(waiting, (-gain, a[0], b[0], next(turns), piece))
 
@@ -150,11 +163,12 @@ def piece_joints(cloud, pieces, grid, some):
     return sorted(found)
 
 
-def joined(cloud, a, b, end_a, end_b):
-    """What it gains to make two pieces one, and that Piece; 0 and None where it does not pay."""
+def joined(cloud, end, other):
+    """What it gains to make the pieces of two Ends one, and that Piece; 0 and None where it does not pay."""
+    a, b = end.piece, other.piece
     own = np.union1d(a.own, b.own)
     shared = np.setdiff1d(np.union1d(a.shared, b.shared), own)
-    found = [free_piece(cloud, a, b, end_a, end_b, own, shared)]
+    found = [free_piece(cloud, end, other, own, shared)]
     if a.arc is not None and b.arc is not None:
         longer = a.arc if a.arc.length >= b.arc.length else b.arc
         found += [arc_piece(cloud, longer, own, shared, straight) for straight in (True, False)]
@@ -182,12 +196,12 @@ def arc_piece(cloud, start, own, shared, straight):
     return piece_of(cloud, arc.recentred(), own, shared)
 
 
-def free_piece(cloud, a, b, end_a, end_b, own, shared):
+def free_piece(cloud, end, other, own, shared):
     """The points of two pieces as a smooth chain of as few cubics as pay; see `joined`."""
     members = np.concatenate([own, shared])
     points, noises = cloud.points[members], cloud.noises[members]
-    ordering = chained(cloud, a, b, end_a, end_b, members)
-    best, most = None, min(a.cubics + b.cubics, MOST_CUBICS)
+    ordering = chained(end, other, members)
+    best, most = None, min(end.piece.cubics + other.piece.cubics, MOST_CUBICS)
     for cubics in range(1, most + 1):
         if len(points) < 6 * cubics:
             break
@@ -199,16 +213,13 @@ def free_piece(cloud, a, b, end_a, end_b, own, shared):
     return best
 
 
-def chained(cloud, a, b, end_a, end_b, members):
-    """Ordering of the members of two pieces: along the one to its end `end_a`, on from `end_b` along the other."""
-    (along_a, ends_a), (along_b, ends_b) = a.lengths(), b.lengths()
-    before = (along_a - ends_a[end_a]) * (1 if end_a else -1)
-    after = (along_b - ends_b[end_b]) * (-1 if end_b else 1)
-    (places_a, outwards), (places_b, _) = a.ends(), b.ends()
-    after = after + (places_b[end_b] - places_a[end_a]) @ outwards[end_a]
+def chained(end, other, members):
+    """Ordering of the members of two pieces: along the one to its End, on from the other End along the other."""
+    (places, outwards), (other_places, _) = end.piece.ends(), other.piece.ends()
+    gap = (other_places[other.side] - places[end.side]) @ outwards[end.side]
     order = np.argsort(members, kind="stable")
     arc = np.zeros(len(members))
-    for piece, along in ((b, after), (a, before)):
+    for piece, along in ((other.piece, gap - other.ways()), (end.piece, end.ways())):
         arc[order[np.searchsorted(members, piece.members, sorter=order)]] = along
     arc -= arc.min()
     return Ordering(arc, float(arc.max()), False)

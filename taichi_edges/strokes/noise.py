@@ -48,9 +48,9 @@ def _residuals(cloud, pair):
     """(length, noise of the places, noise of the directions) of the line and the arc grown from one seed."""
     for grown in pair if pair[0] is not None else ():
         if grown is not None:
-            members, along, squared = cloud.inliers(grown, grown.low, grown.high)
-            if not len(members):
+            on = cloud.inliers(grown, grown.low, grown.high)
+            if not len(on):
                 continue
-            cosines = np.abs((cloud.directions[members] * grown.tangents(along)).sum(axis=1))
-            noise = np.sqrt(np.median(squared)) * cloud.scale.noise / RAYLEIGH
+            cosines = np.abs((cloud.directions[on.members] * grown.tangents(on.along)).sum(axis=1))
+            noise = np.sqrt(np.median(on.squared)) * cloud.scale.noise / RAYLEIGH
             yield grown.length, noise, np.median(np.arccos(np.minimum(cosines, 1.0))) / RAYLEIGH
