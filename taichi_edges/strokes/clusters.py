@@ -4,6 +4,7 @@ import zipfile
 import zlib
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -67,10 +68,10 @@ def read_clusters(path: Path) -> Clusters:
 
 
 # Its arrays tell the kind, and the shape of a row, of each array in a file.
-NO_POINTS = Clusters.of(*np.zeros((2, 0, 3)), np.zeros(0, np.int64))
+NO_POINTS = Clusters.of(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64))
 
 
-def _arrays(clusters):
+def _arrays(clusters: Clusters) -> dict[str, Any]:
     """{name: array} of the file. Columns `arc_..` have a row for each edge that has an Arc."""
     arcs = ArcBatch.of([arc for arc in clusters.arcs if arc is not None])
     return {
@@ -83,7 +84,7 @@ def _arrays(clusters):
     }
 
 
-def _checked(arrays):
+def _checked(arrays: dict[str, np.ndarray]) -> Clusters:
     """The Clusters of what the file holds; ValueError where that does not fit together."""
     for name, like in _arrays(NO_POINTS).items():
         array = arrays[name]
