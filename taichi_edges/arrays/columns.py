@@ -1,14 +1,15 @@
 """Columns: arrays of equal length that belong together, with a row for each of the things they describe."""
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
-from typing import TypeVar
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
 SomeColumns = TypeVar("SomeColumns", bound="Columns")
 
 
+@dataclass(frozen=True)
 class Columns:
     """Base of frozen dataclasses whose fields are columns: arrays with a row for each thing, or Columns themselves.
 
@@ -18,7 +19,7 @@ class Columns:
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))
 
-    def keep(self: SomeColumns, chosen: "np.ndarray | slice") -> SomeColumns:
+    def keep(self: SomeColumns, chosen: np.ndarray | slice) -> SomeColumns:
         """Only the chosen rows. chosen: (n,) bool or indices."""
         return replace(self, **{field.name: _rows(getattr(self, field.name), chosen) for field in fields(self)})
 
@@ -28,13 +29,13 @@ class Columns:
         return cls(**{field.name: _joined([getattr(part, field.name) for part in parts]) for field in fields(cls)})
 
 
-def _rows(column, chosen):
+def _rows(column: Any, chosen: np.ndarray | slice) -> Any:
     if isinstance(column, Columns):
         return column.keep(chosen)
     return column[chosen] if isinstance(column, np.ndarray) else column
 
 
-def _joined(columns):
+def _joined(columns: Sequence[Any]) -> Any:
     first = columns[0]
     if isinstance(first, Columns):
         return type(first).joined(columns)

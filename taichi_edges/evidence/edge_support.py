@@ -4,6 +4,7 @@ The nearest edge owns the edgel: an edge gets no support from its neighbour's ed
 edge projects says nothing against it, for it may be hidden there; that the edgels near it are off it does.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,9 +12,10 @@ import numpy as np
 from scipy.special import gammainc
 
 from taichi_edges.arrays.robust import geman_mcclure
-from taichi_edges.evidence.edgel_matching import MOST_SINE
+from taichi_edges.evidence.edgel_matching import MOST_SINE, EdgelMatching
 from taichi_edges.evidence.explaining import BEST_SUPPORTED, NOISE_PER_MEDIAN, TIGHT_NOISES, TIGHT_PX
 from taichi_edges.evidence.lying import EdgelsAbout, steadiness
+from taichi_edges.geometry.shapes import Shape
 from taichi_edges.geometry.wireframe import Evidence
 
 SPACING_PX = 0.5  # of the samples of an edge; edgels are about 1 px apart, so that hardly one of them is missed
@@ -42,7 +44,7 @@ class EdgeSamples:
     starts: np.ndarray
 
     @staticmethod
-    def along(shapes, spacing):
+    def along(shapes: Sequence[Shape], spacing: float) -> "EdgeSamples":
         """Samples of shapes, about `spacing` apart (units of their frame), one for each shape at least."""
         parameters = [spaced(shape, spacing) for shape in shapes]
         counts = np.array([len(some) for some in parameters], dtype=np.int64)
@@ -56,20 +58,20 @@ class EdgeSamples:
             np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         )
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.points)
 
-    def of(self, edge):
+    def of(self, edge: int) -> slice:
         """Slice of the samples of one shape."""
         return slice(int(self.starts[edge]), int(self.starts[edge + 1]))
 
-    def sums(self, values):
+    def sums(self, values: np.ndarray) -> np.ndarray:
         """(E,) or (E, k) sums of values (n,) or (n, k) over the samples of each shape."""
         totals = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0, dtype=np.float64)])
         return totals[self.starts[1:]] - totals[self.starts[:-1]]
 
 
-def spaced(shape, spacing):
+def spaced(shape: Shape, spacing: float) -> np.ndarray:
     """(n,) parameters in the middles of stretches of equal length, about `spacing` long."""
     count = max(int(round(shape.length / spacing)), 1)
     middles = (np.arange(count) + 0.5) / count
@@ -94,7 +96,7 @@ class Claims:
     rivals: np.ndarray
 
     @staticmethod
-    def of(count, edgels, edges, distances):
+    def of(count: int, edgels: np.ndarray, edges: np.ndarray, distances: np.ndarray) -> "Claims":
         """From pairs of edgel and edge: edgels, edges, distances (p,). count: of edgels. Of ties the first wins."""
         owners, nearest, rivals = np.full(count, np.iinfo(np.int64).max), np.full(count, np.inf), np.full(count, np.inf)
         np.minimum.at(nearest, edgels, distances)
@@ -105,7 +107,7 @@ class Claims:
         np.minimum.at(rivals, edgels[others], distances[others])
         return Claims(owners, nearest, rivals)
 
-    def beside(self, edges, edgels=slice(None)):
+    def beside(self, edges: np.ndarray | int, edgels: np.ndarray | slice = slice(None)) -> np.ndarray:
         """(e,) px from the nearest edge other than a given one, or than (e,) `edges`; of some edgels only, if given."""
         return np.where(self.owners[edgels] == edges, self.rivals[edgels], self.distances[edgels])
 
@@ -129,12 +131,12 @@ class Support:
     least_views: float
 
     @cached_property
-    def views(self):
+    def views(self) -> np.ndarray:
         """(n,) number of views that support each sample, each counted by its weight."""
         return self.weights.sum(axis=1)
 
     @cached_property
-    def certainty(self):
+    def certainty(self) -> np.ndarray:
         """(n,) that so many views do not agree by chance, 0 to 1.
 
         Two viewing planes always meet. How many more do by chance is a matter of Poisson's distribution.
@@ -143,7 +145,7 @@ class Support:
         return np.where(beyond > 0, 1.0 - gammainc(np.maximum(beyond, 1e-9), self.chance), 0.0)
 
     @cached_property
-    def noise_px(self):
+    def noise_px(self) -> float:
         """Standard deviation of the residuals of the best-supported fifth of the samples, px.
 
         Of their core: close to other edges the tails are these.
@@ -159,19 +161,19 @@ class Support:
         return noise if len(residuals) else 0.0
 
     @cached_property
-    def supported_lengths(self):
+    def supported_lengths(self) -> np.ndarray:
         """(E,) length that `least_views` see, each counted by its weight."""
         return self.samples.sums(self.samples.lengths * (self.views >= self.least_views))
 
     @cached_property
-    def residual_px(self):
+    def residual_px(self) -> np.ndarray:
         """(E,) root mean square distance of the edgels of each edge, px; 0 where there are none."""
         found = (self.edgels >= 0).sum(axis=1)
         squares = np.where(self.edgels >= 0, self.residuals.astype(np.float64) ** 2, 0.0).sum(axis=1)
         return np.sqrt(self.samples.sums(squares) / np.maximum(self.samples.sums(found), 1))
 
 
-def support_of(matching, shapes, radius=MATCH_PX):
+def support_of(matching: EdgelMatching, shapes: Sequence[Shape], radius: float = MATCH_PX) -> Support:
     """The Support of shapes. matching: EdgelMatching. radius: px, of the matches.
 
     The noise can make an edgel nearer to the wrong one of two edges, so an edge with fewer views on its length than the
@@ -185,7 +187,7 @@ def support_of(matching, shapes, radius=MATCH_PX):
     return _owned(matching, samples, found, handicaps)
 
 
-def _owned(matching, samples, about, handicaps):
+def _owned(matching: EdgelMatching, samples: EdgeSamples, about: EdgelsAbout, handicaps: np.ndarray) -> Support:
     """The Support of samples with all EdgelsAbout them. handicaps: (E,) px by which edges count as farther away."""
     at, view = np.nonzero(about.there)
     found, edges = about.edgels[at, view], samples.edges[at]
@@ -196,7 +198,7 @@ def _owned(matching, samples, about, handicaps):
     return Support(samples, edgels, about.residuals, weights, claims, chance_weight(matching), matching.least_views)
 
 
-def evidence_of(support):
+def evidence_of(support: Support) -> list[Evidence]:
     """One Evidence for each edge of a Support: what the views say when every edgel supports one edge alone.
 
     `confidence` is the share of the length that is not there by chance (`Support.certainty`), times how well its edgels
@@ -212,7 +214,7 @@ def evidence_of(support):
     return [Evidence(int(views), *map(float, rest)) for views, *rest in columns]
 
 
-def steadiness_of_edges(matching, support):
+def steadiness_of_edges(matching: EdgelMatching, support: Support) -> np.ndarray:
     """(E,) share of the edgels about each edge that lie on it, of those that no other edge owns.
 
     matching: EdgelMatching. support: Support of the edges.
@@ -228,19 +230,21 @@ def steadiness_of_edges(matching, support):
     return steadiness(*(np.bincount(numbers[some], minlength=count) for some in (on, mine)))
 
 
-def support_share(matching, support):
+def support_share(matching: EdgelMatching, support: Support) -> np.ndarray:
     """(E,) number of views that support each edge, each counted by its weight, of those that have it in their image."""
     samples = support.samples
     inside = EdgelsAbout.of(matching, samples.points, samples.directions, MATCH_PX).inside.sum(axis=1)
     return samples.sums(support.views) / np.maximum(samples.sums(inside), 1)
 
 
-def claims_of(matching, shapes):
+def claims_of(matching: EdgelMatching, shapes: Sequence[Shape]) -> Claims:
     """The Claims of shapes, for `support_along`. matching: EdgelMatching."""
     return support_of(matching, shapes).claims
 
 
-def support_along(matching, shape, parameters, claims=None, own=-1):
+def support_along(
+    matching: EdgelMatching, shape: Shape, parameters: np.ndarray, claims: Claims | None = None, own: int = -1
+) -> np.ndarray:
     """How many views support places on a shape or beyond its ends, each counted by its weight, see `Support`. (n,)
 
     parameters: (n,) of the places. claims: Claims of all edges, whose edgels do not count unless they are this shape's
@@ -249,7 +253,12 @@ def support_along(matching, shape, parameters, claims=None, own=-1):
     return support_of_places(matching, [(shape, parameters)], claims, [own])[0]
 
 
-def support_of_places(matching, places, claims=None, owns=()):
+def support_of_places(
+    matching: EdgelMatching,
+    places: Sequence[tuple[Shape, np.ndarray]],
+    claims: Claims | None = None,
+    owns: Sequence[int] = (),
+) -> list[np.ndarray]:
     """`support_along` for many shapes at once. places: [(shape, parameters)]. owns: the index of each of the shapes.
 
     A kernel takes as long to start as to look up some hundred places.
@@ -270,7 +279,7 @@ def support_of_places(matching, places, claims=None, owns=()):
     return np.split(views, np.cumsum(counts)[:-1])
 
 
-def chance_weight(matching):
+def chance_weight(matching: EdgelMatching) -> float:
     """Sum of the weights, over all views, of the edgels that a random place with a random direction has.
 
     From how densely the edgels fill the part of each image where there are any, a pixel of an edge each.
@@ -283,7 +292,7 @@ def chance_weight(matching):
     return total
 
 
-def _weights(matching, edgels, residuals):
+def _weights(matching: EdgelMatching, edgels: np.ndarray, residuals: np.ndarray) -> np.ndarray:
     """(n, V) strength times closeness of matched edgels, 0 where there is none."""
     weights, at = np.zeros(edgels.shape, np.float32), edgels >= 0
     squared = (residuals[at] / matching.scale_px) ** 2

@@ -4,6 +4,7 @@ Sums run over the views in order, so no result depends on the number of threads.
 """
 
 from functools import cached_property
+from types import FunctionType
 
 import numpy as np
 import taichi as ti
@@ -15,7 +16,7 @@ from taichi_edges.kernels.device import download, upload
 from taichi_edges.kernels.edgel_grid import CELL, EdgelGrid
 from taichi_edges.kernels.points import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D, blocks_of, load_camera, load_point
 from taichi_edges.views.cameras import NEAR
-from taichi_edges.views.views import pixel_size
+from taichi_edges.views.views import Views, pixel_size
 
 MOST_SINE = 0.35  # of the angle between an edgel and a projected direction: 20 degrees, as a bend or noise may turn it
 OWNED_PX, OWNED_MOST = 2.0, 6  # neighbours of an edgel: those so near, itself included, at most so many,
@@ -23,7 +24,9 @@ OWNED_BESIDE_PX = 0.5  # and no farther to the side: an edge may run beside anot
 APART = 100.0  # px; views are laid out so far apart when one tree holds the edgels of all of them
 LEAST_VIEWS = 2.5  # of full strength; two planes always meet
 
-geman_mcclure = ti.func(robust.geman_mcclure)
+# Taichi reads types and knows none of NumPy's: the same code without them.
+_weight = robust.geman_mcclure
+geman_mcclure = ti.func(FunctionType(_weight.__code__, {}, _weight.__name__, _weight.__defaults__))
 
 
 class EdgelMatching:
@@ -34,7 +37,8 @@ class EdgelMatching:
     its weight.
     """
 
-    def __init__(self, views, least_views=LEAST_VIEWS):
+    def __init__(self, views: Views, least_views: float = LEAST_VIEWS) -> None:
+        assert views.edgels is not None
         self.edgels, self.pixel = views.edgels, pixel_size(views)
         self.scale_px, self.least_views = views.tolerance_px, least_views
         self.grid = EdgelGrid(views.edgels, views.height, views.width)
@@ -42,12 +46,12 @@ class EdgelMatching:
         self.cameras = upload((views.intrinsics @ views.world_to_camera).astype(np.float32))
 
     @property
-    def projections(self):
+    def projections(self) -> np.ndarray:
         """(V, 3, 4) intrinsics @ world_to_camera, rounded to float32 as the kernels have them."""
         return download(self.cameras).astype(np.float64)
 
     @cached_property
-    def neighbors(self):
+    def neighbors(self) -> np.ndarray:
         """(n, OWNED_MOST) indices of the edgels before and after each on its 2D edge, itself included and repeated."""
         points, own = self.edgels.points, np.arange(len(self.edgels))[:, None]
         places = np.column_stack([points, APART * self.edgels.views])
@@ -57,12 +61,12 @@ class EdgelMatching:
         return np.where(beside <= OWNED_BESIDE_PX, near, own)
 
     @cached_property
-    def densities(self):
+    def densities(self) -> list[tuple[float, float]]:
         """[(sum of strengths, px^2)] of the edgels of each view that has any, and of the box around them."""
         views = [self.edgels.of_view(view) for view in range(self.edgels.view_count)]
         return [(some.sum(), np.prod(np.ptp(points, axis=0) + 1.0)) for points, _, some in views if len(points)]
 
-    def equations(self, points, directions, radius, scale):
+    def equations(self, points: np.ndarray, directions: np.ndarray, radius: float, scale: float) -> PlaneEquations:
         """PlaneEquations of the edgels next to points.
 
         points, directions: (n, 3). radius: px, of the edgels looked at. scale: px, of the robust weights.
@@ -78,12 +82,12 @@ class EdgelMatching:
         return PlaneEquations.of(download(equations))
 
     @cached_property
-    def planes(self):
+    def planes(self) -> np.ndarray | ti.Ndarray:
         """(e, 5) float32, where kernels run: position, normal and strength of each edgel."""
         columns = [self.edgels.points, self.edgels.normals, self.edgels.strengths[:, None]]
         return upload(np.concatenate(columns, axis=1).astype(np.float32))
 
-    def equations_of(self, points, edgels, scale):
+    def equations_of(self, points: np.ndarray, edgels: np.ndarray, scale: float) -> PlaneEquations:
         """`equations` of the edgels that each point is said to have: (n, V) int32 index into Edgels, -1 none.
 
         In how many images the points are is not asked.
@@ -94,7 +98,9 @@ class EdgelMatching:
             add_equations_of(*blocks_of(points), points, self.cameras, edgels, self.planes, float(scale), equations)
         return PlaneEquations.of(download(equations))
 
-    def matches(self, points, directions, views, radius):
+    def matches(
+        self, points: np.ndarray, directions: np.ndarray, views: slice, radius: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(n, v) int32: the edgel, an index into Edgels, that each point has in some views (a slice); -1 none.
 
         Also (n, v) float32, its distance across the edgel, px, signed along the normal; and (n, v) bool, whether the

@@ -4,12 +4,18 @@ A stray point that projects onto the lines of other edges has support in many vi
 occluding contour has edgels of its own, but moves with the viewpoint: they lie all around its projections, not on them.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from taichi_edges.arrays.columns import Columns
 from taichi_edges.evidence.lying import EdgelsAbout, steadiness
+
+if TYPE_CHECKING:
+    from taichi_edges.evidence.edgel_matching import EdgelMatching
+    from taichi_edges.evidence.viewing_planes import RefinedPoints
 
 ROUNDS = 4  # owners whose own support turns out weak lose their edgels in the next round
 MATCH_PX = 1.0  # a point explains an edgel within this distance
@@ -40,12 +46,12 @@ class Explained(Columns):
     noise_px: float
 
     @property
-    def tight_px(self):
+    def tight_px(self) -> float:
         """Residual up to which an edgel lies on an edge."""
         return max(TIGHT_PX, TIGHT_NOISES * self.noise_px)
 
 
-def explain(matching, refined):
+def explain(matching: "EdgelMatching", refined: "RefinedPoints") -> Explained:
     """Explained for `RefinedPoints`. matching: EdgelMatching.
 
     The strongest point owns an edgel it lies on, with its neighbours along the line; a point beside the owner, on the
@@ -67,17 +73,17 @@ def explain(matching, refined):
     return Explained(owned, share / usual, refined.spread, noise)
 
 
-def _best(support):
+def _best(support: np.ndarray) -> np.ndarray:
     """(n,) bool: the best-supported points."""
     return support >= np.quantile(support, 1 - BEST_SUPPORTED) if len(support) else np.zeros(0, bool)
 
 
-def unexplained(matching, refined):
+def unexplained(matching: "EdgelMatching", refined: "RefinedPoints") -> np.ndarray:
     """(e,) bool: the edgels that none of the RefinedPoints, all of them trusted, lies on."""
     return _owners(matching, refined, refined.support) < 0
 
 
-def _in_parts(matching, refined, radius):
+def _in_parts(matching: "EdgelMatching", refined: "RefinedPoints", radius: float) -> Iterator[EdgelsAbout]:
     """EdgelsAbout the RefinedPoints, some views at a time."""
     count = matching.edgels.view_count
     for first in range(0, count, VIEWS_AT_ONCE):
@@ -85,7 +91,7 @@ def _in_parts(matching, refined, radius):
         yield EdgelsAbout.of(matching, refined.points, refined.directions, radius, some)
 
 
-def _owners(matching, refined, strength):
+def _owners(matching: "EdgelMatching", refined: "RefinedPoints", strength: np.ndarray) -> np.ndarray:
     """(e,) index of the strongest point on each edgel or on one of its neighbours, -1 where there is none."""
     order = np.argsort(strength, kind="stable")
     ranks = np.empty(len(refined), np.int64)
@@ -98,7 +104,9 @@ def _owners(matching, refined, strength):
     return np.append(order, -1)[best]
 
 
-def _whose(matching, refined, owners, matches, beside):
+def _whose(
+    matching: "EdgelMatching", refined: "RefinedPoints", owners: np.ndarray, matches: np.ndarray, beside: float
+) -> np.ndarray:
     """(n, v) int: 1 where the matched edgel is the point's own, -1 where it is another edge's, 0 no edgel or owner.
 
     beside: px; so far across its direction another point is on the same edge.
@@ -115,14 +123,16 @@ def _whose(matching, refined, owners, matches, beside):
     return whose
 
 
-def _noise(matching, best):
+def _noise(matching: "EdgelMatching", best: "RefinedPoints") -> float:
     """Standard deviation, px, of the residuals of the `best` points."""
-    residuals = [part.residuals[part.there] for part in _in_parts(matching, best, MATCH_PX)]
-    residuals = np.concatenate([np.zeros(0), *residuals])
+    parts = [part.residuals[part.there] for part in _in_parts(matching, best, MATCH_PX)]
+    residuals = np.concatenate([np.zeros(0), *parts])
     return float(NOISE_PER_MEDIAN * np.median(np.abs(residuals))) if len(residuals) else 0.0
 
 
-def _steadiness_of_points(matching, refined, owners, tight, beside):
+def _steadiness_of_points(
+    matching: "EdgelMatching", refined: "RefinedPoints", owners: np.ndarray, tight: float, beside: float
+) -> np.ndarray:
     """(n,) see Explained, not yet relative. tight, beside: px."""
     on, about = np.zeros(len(refined)), np.zeros(len(refined))
     for part in _in_parts(matching, refined, NEAR_PX):

@@ -6,8 +6,14 @@ it is its steadiness. Who counts differs: an edgel that another edge explains sa
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from taichi_edges.evidence.edgel_matching import EdgelMatching
+
+Counts = TypeVar("Counts", float, np.ndarray)
 
 
 @dataclass(frozen=True)
@@ -23,21 +29,27 @@ class EdgelsAbout:
     inside: np.ndarray
 
     @staticmethod
-    def of(matching, points, directions, radius, views=None):
+    def of(
+        matching: "EdgelMatching",
+        points: np.ndarray,
+        directions: np.ndarray,
+        radius: float,
+        views: slice | None = None,
+    ) -> "EdgelsAbout":
         """Those within `radius` px. matching: EdgelMatching. points, directions: (n, 3). views: a slice, None: all."""
         views = slice(0, matching.edgels.view_count) if views is None else views
         return EdgelsAbout(*matching.matches(points, directions, views, radius))
 
     @property
-    def there(self):
+    def there(self) -> np.ndarray:
         """(n, v) bool: where there is an edgel."""
         return self.edgels >= 0
 
-    def within(self, px):
+    def within(self, px: float) -> np.ndarray:
         """(n, v) bool: where there is an edgel no farther than so many pixels across."""
         return self.there & (np.abs(self.residuals) <= px)
 
 
-def steadiness(on, about):
+def steadiness(on: Counts, about: Counts) -> Counts:
     """The share of the edgels about places that lie on them; 0 where there are none. on, about: counts, alike."""
     return on / np.maximum(about, 1)

@@ -4,6 +4,8 @@ Sums run over the views in order, the owner of a pixel is the highest of distinc
 result depends on the number of threads.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import taichi as ti
 
@@ -25,6 +27,9 @@ from taichi_edges.kernels.points import (
 )
 from taichi_edges.views.cameras import NEAR
 
+if TYPE_CHECKING:
+    from taichi_edges.views.views import Views
+
 BATCH_BYTES = 16 << 20  # images and pixel lists of the views that are worked on together
 LARGEST_I32 = 2**31 - 1
 
@@ -36,7 +41,7 @@ class PixelOwners:
     strength: (n,) mean map value 0..1. seen: (n,) number of views that have the point in the image, at least 1.
     """
 
-    def __init__(self, views, points, threshold):
+    def __init__(self, views: "Views", points: np.ndarray, threshold: float) -> None:
         count = len(points)
         per_view = 4 * (views.height * views.width + count)
         size = min(max(BATCH_BYTES // per_view, 1), len(views))
@@ -44,7 +49,8 @@ class PixelOwners:
         self.claims = upload(np.zeros((size, views.height, views.width), np.int32))
         self.pixels = upload(np.zeros((size, count), np.int32))
         self.claimed = 0  # how often the points have claimed their pixels in `claims`
-        self.batches = []  # (projections, edge bits) of the views of each batch
+        # (projections, edge bits) of the views of each batch
+        self.batches: list[tuple[np.ndarray | ti.Ndarray, np.ndarray | ti.Ndarray]] = []
         projections = (views.intrinsics @ views.world_to_camera).astype(np.float32)
         total, seen = upload(np.zeros(count, np.float32)), upload(np.zeros(count, np.int32))
         level = int(np.ceil(threshold * 255))
@@ -57,7 +63,7 @@ class PixelOwners:
         self.seen = np.maximum(download(seen), 1)
         self.strength = download(total).astype(np.float64) / self.seen / 255.0
 
-    def owned_share(self, strength, claim_px, reach):
+    def owned_share(self, strength: np.ndarray, claim_px: float, reach: float) -> np.ndarray:
         """(n,) share of the views that see a point in which its pixel is an edge pixel and owned by a point beside it.
 
         strength: (n,), the stronger one owns a pixel. claim_px: pixels. reach: unit-cube units.
@@ -75,7 +81,7 @@ class PixelOwners:
             count_support(*blocks, cameras.shape[0], self.points, *claimed, claim_px, reach, supported)
         return download(supported) / self.seen
 
-    def _next_offset(self, count):
+    def _next_offset(self, count: int) -> int:
         """What to add to ranks below `count` so that claims outbid all those made before."""
         self.claimed += 1
         if (self.claimed + 1) * count > LARGEST_I32:

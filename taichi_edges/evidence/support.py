@@ -8,17 +8,18 @@ import weakref
 import cv2
 import numpy as np
 
-from taichi_edges.views.views import pixel_size
+from taichi_edges.views.views import Views, pixel_size
 
 OWNER_ROUNDS = 4  # owners whose own support turns out weak lose their pixels in the next round
 CLAIM = 0.8  # a point claims the pixels within this many line widths of its projection
 SAME_EDGE = 2.5  # a pixel supports the points within this many line widths (in 3D) of its owner
 WIDTH_VIEWS = 64  # the width of the lines is measured in so many views at most
 
-_widths = {}  # (id of Views, threshold): line width in pixels; an entry goes with its Views
+# (id of Views, threshold): line width in pixels; an entry goes with its Views.
+_widths: dict[tuple[int, float], float] = {}
 
 
-def edge_strength(views, points):
+def edge_strength(views: Views, points: np.ndarray) -> np.ndarray:
     """Mean value of the edge maps, 0..1 of full scale, at the projections of (n, 3) unit-cube points.
 
     Over the views that have the point in front of the camera and inside the image; bilinear; 0 where there is none.
@@ -32,7 +33,7 @@ def edge_strength(views, points):
     return strength
 
 
-def line_width(views, threshold):
+def line_width(views: Views, threshold: float) -> tuple[float, float]:
     """Typical width of the lines in the edge maps: pixels, and unit-cube units at the middle of the scene box.
 
     threshold: of full scale. Measured once for each Views.
@@ -44,7 +45,7 @@ def line_width(views, threshold):
     return _widths[key], _widths[key] * pixel_size(views)
 
 
-def _measure_width(edge_maps, threshold):
+def _measure_width(edge_maps: np.ndarray, threshold: float) -> float:
     """Pixels. Inside a band of w pixels the distance from a pixel's centre to that of the nearest pixel outside is
     (w + 2) / 4 on average.
     """
@@ -58,7 +59,7 @@ def _measure_width(edge_maps, threshold):
     return max(4.0 * distances / max(pixels, 1) - 2.0, 1.0)
 
 
-def exclusive_support(views, points, threshold):
+def exclusive_support(views: Views, points: np.ndarray, threshold: float) -> np.ndarray:
     """Share of the views in which a point lies on an edge pixel that no better point elsewhere explains.
 
     points: (n, 3) unit cube. threshold: of full scale. In every view the strongest point that projects near a pixel
@@ -81,7 +82,7 @@ def exclusive_support(views, points, threshold):
     return support
 
 
-def _finite(points):
+def _finite(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Those of the (n, 3) points that are finite numbers, as float32, and which they are, (n,) bool."""
     with np.errstate(over="ignore"):
         points = np.asarray(points, np.float32)

@@ -5,11 +5,17 @@ is the edge: its direction is what all planes have in common, its place their ro
 image loss converges to, but the loss sees grey levels of drawn lines, and these planes the sub-pixel points themselves.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from taichi_edges.arrays.columns import Columns
+
+if TYPE_CHECKING:
+    from taichi_edges.evidence.edgel_matching import EdgelMatching
+    from taichi_edges.evidence.plane_equations import PlaneEquations
 
 RADII_PX = (3.0, 2.0, 1.5, 1.2, 1.0, 1.0)  # of the edgels that are looked at, round by round
 LEAST_SPREAD = 0.02  # planes that lean against each other less (squared sine) say nothing across their common side
@@ -33,7 +39,9 @@ class RefinedPoints(Columns):
     spread: np.ndarray
 
 
-def refine_points(matching, points, directions, radii=RADII_PX):
+def refine_points(
+    matching: "EdgelMatching", points: np.ndarray, directions: np.ndarray, radii: Sequence[float] = RADII_PX
+) -> RefinedPoints:
     """Points and directions moved to the robust intersection of the viewing planes of their edgels.
 
     matching: EdgelMatching. points: (n, 3) unit cube. directions: (n, 3) unit vectors. radii: px, one for each round,
@@ -51,7 +59,7 @@ def refine_points(matching, points, directions, radii=RADII_PX):
     return RefinedPoints(points, directions, views, views / np.maximum(equations.views, 1.0), spread)
 
 
-def _solve(equations, directions):
+def _solve(equations: "PlaneEquations", directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Steps (n, 3) across the common direction of the planes, and that direction where there is one.
 
     equations: PlaneEquations. directions: (n, 3), so far.

@@ -31,9 +31,9 @@ class ArcBatch(Columns):
     @staticmethod
     def of(arcs: Sequence[Arc]) -> "ArcBatch":
         """From a list of Arcs."""
-        vectors = (np.array([getattr(arc, name) for arc in arcs]).reshape(-1, 3) for name in VECTORS)
+        origin, tangent, bend = (np.array([getattr(arc, name) for arc in arcs]).reshape(-1, 3) for name in VECTORS)
         low, high = (np.array([getattr(arc, name) for arc in arcs], np.float64) for name in ("low", "high"))
-        return ArcBatch(*vectors, low, high, np.array([arc.closed for arc in arcs], bool))
+        return ArcBatch(origin, tangent, bend, low, high, np.array([arc.closed for arc in arcs], bool))
 
     def __iter__(self) -> Iterator[Arc]:
         """One Arc after the other."""

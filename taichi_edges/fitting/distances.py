@@ -3,10 +3,10 @@
 import numpy as np
 
 from taichi_edges.fitting.cubic_chains import nearest_on_chain
-from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
+from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline
 
 
-def distances_to(shape: Line | EllipticArc | Spline, points: np.ndarray) -> np.ndarray:
+def distances_to(shape: Shape, points: np.ndarray) -> np.ndarray:
     """(n,) distances of points to a shape, ends included."""
     if isinstance(shape, Spline):
         return nearest_on_chain(points, shape.curves)[0]

@@ -15,7 +15,7 @@ from taichi_edges.fitting.arcs import Arc, fit_arc, through_three
 from taichi_edges.fitting.cubic_chains import Ordering, fit_chain
 from taichi_edges.fitting.distances import distances_to, unit
 from taichi_edges.fitting.prices import CUBIC_PRICE, MOST_CUBICS, NEXT_CUBIC_PRICE, OUTLIER, PRICES, price_of
-from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
+from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline
 
 LEAST_BEND = 1.0  # noises that the middle of an arc is off its chord, at least
 LEAST_FLATNESS = 0.05  # of an ellipse: the shorter axis over the longer one
@@ -24,7 +24,7 @@ FIT_ROUNDS = 4
 STRETCH_PX = 4.0  # length of an edge on which the errors go together
 FEWEST_PLACES = 8  # on a shape, however short it is
 
-Fit = Callable[[], Line | EllipticArc | Spline | None]
+Fit = Callable[[], Shape | None]
 
 
 @dataclass(frozen=True)
@@ -75,9 +75,7 @@ def observations(share: np.ndarray, yardstick: Yardstick) -> float:
     return max(float(share.sum()) / yardstick.stretch, np.e)
 
 
-def best_shape(
-    track: Track, yardstick: Yardstick, count: float, worth: float = np.inf
-) -> tuple[Line | EllipticArc | Spline | None, float]:
+def best_shape(track: Track, yardstick: Yardstick, count: float, worth: float = np.inf) -> tuple[Shape | None, float]:
     """The shape that describes a Track best, and its cost; None and infinity where none is cheaper than `worth`.
 
     count: number of observations of all that is compared.
@@ -209,7 +207,7 @@ def _spanning(arc: Arc, track: Track) -> Arc:
     return arc.over(low, low + arc.round if track.closed else min(high, low + arc.round))
 
 
-def track_of(shape: Line | EllipticArc | Spline, spacing: float) -> Track:
+def track_of(shape: Shape, spacing: float) -> Track:
     """The Track of a shape, places at most `spacing` apart, at the middles of equal steps."""
     count = max(int(np.ceil(shape.length / spacing)), FEWEST_PLACES)
     fine = np.linspace(0, 1, 4 * count + 1)

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
+from taichi_edges.geometry.shapes import Shape, Spline
 
 if TYPE_CHECKING:
     from taichi_edges.fitting.arcs import Arc
@@ -19,7 +19,7 @@ def price_of_arc(arc: "Arc") -> int:
     return LINE_PRICE if arc.curvature == 0 else ARC_PRICE
 
 
-def price_of(shape: Line | EllipticArc | Spline) -> int:
+def price_of(shape: Shape) -> int:
     """Number of free parameters of a shape, with its ends."""
     if isinstance(shape, Spline):
         return CUBIC_PRICE + NEXT_CUBIC_PRICE * (len(shape.curves) - 1)

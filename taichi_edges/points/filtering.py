@@ -6,6 +6,7 @@ once more, for edges seen in few views; and all is grown along its tangents.
 """
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -13,6 +14,12 @@ from scipy.spatial import cKDTree
 from taichi_edges.arrays.columns import Columns
 from taichi_edges.evidence.explaining import Explained, explain, unexplained
 from taichi_edges.evidence.support import exclusive_support
+
+if TYPE_CHECKING:
+    from taichi_edges.evidence.edgel_matching import EdgelMatching
+    from taichi_edges.evidence.viewing_planes import RefinedPoints
+    from taichi_edges.scene.settings import FilterConfig
+    from taichi_edges.views.views import Views
 
 AROUND = 9  # points, itself included, over which the steadiness of a point is a median
 CONTINUED = 0.5  # views that may be fewer where an edge goes on
@@ -49,7 +56,15 @@ class TrustedPoints(Columns):
     explained: Explained | None = None
 
 
-def filter_points(means, directions, opacities, views, config, edge_threshold, generator):
+def filter_points(
+    means: np.ndarray,
+    directions: np.ndarray,
+    opacities: np.ndarray,
+    views: "Views",
+    config: "FilterConfig",
+    edge_threshold: float,
+    generator: np.random.Generator,
+) -> tuple[TrustedPoints, FilterCounts]:
     """The centres that are opaque, supported by the edge maps and not isolated; refined if the scene wants that.
 
     means: (n, 3) unit cube. directions: (n, 3) unit vectors. opacities: (n,). config: the scene's `filter` section.
@@ -59,21 +74,21 @@ def filter_points(means, directions, opacities, views, config, edge_threshold, g
     opaque = np.asarray(opacities) >= config.min_opacity
     points, directions = (np.asarray(array, dtype=np.float64)[opaque] for array in (means, directions))
     if config.refine:
-        trusted, counts = refined_points(points, directions, views, config, edge_threshold, generator)
+        trusted, filtered = refined_points(points, directions, views, config, edge_threshold, generator)
     else:
         on_edges = _on_edge_pixels(points, views, config.min_support, edge_threshold)
-        trusted, counts = TrustedPoints(points, directions).keep(on_edges), {"low_support": int((~on_edges).sum())}
+        trusted, filtered = TrustedPoints(points, directions).keep(on_edges), {"low_support": int((~on_edges).sum())}
     inliers = statistical_inliers(trusted.points, config.outlier_neighbors, config.outlier_deviations)
     counts = FilterCounts(
         gaussians=len(opaque),
         low_opacity=int((~opaque).sum()),
-        **counts,
+        **filtered,
         outliers=len(trusted) - len(inliers),
     )
     return trusted.keep(inliers), counts
 
 
-def _on_edge_pixels(points, views, least, edge_threshold):
+def _on_edge_pixels(points: np.ndarray, views: "Views", least: float, edge_threshold: float) -> np.ndarray:
     """(n,) bool: which points fall on edge pixels of their own in this share of the views that could see them.
 
     Those are the views that have a point in front of the camera and inside the image; that an edge is hidden in many of
@@ -83,7 +98,14 @@ def _on_edge_pixels(points, views, least, edge_threshold):
     return (support >= least) & (support > 0)
 
 
-def refined_points(points, directions, views, config, edge_threshold, generator):
+def refined_points(
+    points: np.ndarray,
+    directions: np.ndarray,
+    views: "Views",
+    config: "FilterConfig",
+    edge_threshold: float,
+    generator: np.random.Generator,
+) -> tuple[TrustedPoints, dict[str, int]]:
     """TrustedPoints on the edges that the edgels of the views agree on. Arguments as for `filter_points`.
 
     Returns also the counts of FilterCounts that this is about.
@@ -123,17 +145,17 @@ class Judgement(Columns):
     explained: Explained
 
     @property
-    def weak(self):
+    def weak(self) -> int:
         """How many are not supported."""
         return int((~self.supported).sum())
 
     @property
-    def unsteady(self):
+    def unsteady(self) -> int:
         """How many are supported, but not steady."""
         return int((self.supported & ~self.steady).sum())
 
 
-def judge(matching, refined, config):
+def judge(matching: "EdgelMatching", refined: "RefinedPoints", config: "FilterConfig") -> Judgement:
     """The Judgement of RefinedPoints.
 
     An occluding contour is not steady: its support comes from views that happen to look from similar directions.
@@ -153,22 +175,29 @@ def judge(matching, refined, config):
     return Judgement(supported, steady, explained)
 
 
-def harvest(matching, refined, views, config, edge_threshold, generator):
+def harvest(
+    matching: "EdgelMatching",
+    refined: "RefinedPoints",
+    views: "Views",
+    config: "FilterConfig",
+    edge_threshold: float,
+    generator: np.random.Generator,
+) -> "RefinedPoints":
     """RefinedPoints on edges that few views see, voted for by the edgels that the `refined` ones leave unexplained."""
     from taichi_edges.evidence.edgel_matching import EdgelMatching
     from taichi_edges.evidence.viewing_planes import refine_points
     from taichi_edges.seeding.voting import vote_seeds
     from taichi_edges.views.drawing import draw_edge_maps
 
-    left = views.edgels.keep(unexplained(matching, refined))
-    left = replace(views, edgels=left, edge_maps=draw_edge_maps(left, views.height, views.width))
+    edgels = matching.edgels.keep(unexplained(matching, refined))
+    left = replace(views, edgels=edgels, edge_maps=draw_edge_maps(edgels, views.height, views.width))
     seeds = vote_seeds(left, edge_threshold, generator, keep=HARVEST_KEEP)
     matching = EdgelMatching(left, matching.least_views)
     found = refine_points(matching, seeds.points, seeds.directions)
     return found.keep(judge(matching, found, config).steady)
 
 
-def statistical_inliers(points, neighbors, deviations):
+def statistical_inliers(points: np.ndarray, neighbors: int, deviations: float) -> np.ndarray:
     """Indices of the points whose mean distance to their neighbours is at most mean + deviations * std over all points.
 
     Open3D's statistical outlier removal. neighbors 0 switches it off.

@@ -3,10 +3,15 @@
 Seeds are sparse where an edge is faint or often hidden. What is found of it tells where it goes on.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.spatial import cKDTree
 
 from taichi_edges.evidence.viewing_planes import RefinedPoints, refine_points
+
+if TYPE_CHECKING:
+    from taichi_edges.evidence.edgel_matching import EdgelMatching
 
 STEP_PX = 1.0  # of a step along the tangent
 RADII_PX = (1.5, 1.0, 1.0)  # of the refinement of a step
@@ -16,7 +21,7 @@ LEAST_COSINE = 0.8  # between the directions before and after a step
 MOST_ROUNDS = 200
 
 
-def grow_points(matching, refined, least):
+def grow_points(matching: "EdgelMatching", refined: RefinedPoints, least: np.ndarray) -> RefinedPoints:
     """RefinedPoints and the points that continue them, each the step after another.
 
     matching: EdgelMatching. least: (n,) share of the views that the points which continue each of them need.
@@ -31,7 +36,9 @@ def grow_points(matching, refined, least):
     return refined
 
 
-def _next_points(matching, newest, tree, step, least):
+def _next_points(
+    matching: "EdgelMatching", newest: RefinedPoints, tree: cKDTree, step: float, least: np.ndarray
+) -> tuple[RefinedPoints, np.ndarray]:
     """The refined points one step on from the `newest` ones, both ways, where nothing is yet; and their `least`."""
     ahead = np.concatenate([newest.points + step * newest.directions, newest.points - step * newest.directions])
     free = np.flatnonzero(tree.query(ahead)[0] > COVERED * step)
@@ -47,13 +54,13 @@ def _next_points(matching, newest, tree, step, least):
     return found.keep(good), least[good]
 
 
-def _one_for_each_cell(points, size):
+def _one_for_each_cell(points: np.ndarray, size: float) -> np.ndarray:
     """Indices of the first of the points in each cubic cell."""
     cells = np.floor(points / size).astype(np.int64)
     return np.sort(np.unique(cells, axis=0, return_index=True)[1])
 
 
-def _best_apart(found, distance):
+def _best_apart(found: RefinedPoints, distance: float) -> np.ndarray:
     """(n,) bool: of points that are closer than `distance` the better supported ones."""
     kept = np.ones(len(found), bool)
     if len(found) < 2:

@@ -14,17 +14,24 @@ Unknowns are the vertices, which edges share, and what each shape has of its own
 off, so the ends of an edge are where it meets others and not where its edgels end.
 """
 
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.sparse import coo_matrix, diags, identity
+from scipy.sparse import coo_matrix, csc_matrix, diags, identity
 from scipy.sparse.linalg import spsolve
 
 from taichi_edges.arrays.robust import widening
-from taichi_edges.evidence.edge_support import SPACING_PX, support_of
+from taichi_edges.evidence.edge_support import SPACING_PX, EdgeSamples, support_of
+from taichi_edges.geometry.shapes import Shape
 from taichi_edges.geometry.wireframe import Wireframe
 from taichi_edges.refinement.charts import derivatives, moved, nearest_parameters, neighbors, own_unknowns
+
+if TYPE_CHECKING:
+    from taichi_edges.evidence.edgel_matching import EdgelMatching
+    from taichi_edges.evidence.plane_equations import PlaneEquations
 
 RADII_PX = (3.0, 2.0, 1.5, 1.0, 1.0)  # of the edgels that are looked at, round by round
 CORRELATED_PX = 40.0  # along an edge: pixels that count as one observation; 20 to 55 in images and in learned maps
@@ -52,11 +59,11 @@ class Constraint:
     gives, which is found but once for all constraints.
     """
 
-    edges: tuple
-    values: object
+    edges: tuple[int, ...]
+    values: Callable[..., np.ndarray]
     deviation: float
     hard: bool = False
-    about: object = None
+    about: Callable[[Shape], np.ndarray] | None = None
 
 
 @dataclass(frozen=True)
@@ -66,11 +73,11 @@ class Layout:
     columns: one int array for each edge, the ends first. size: number of unknowns.
     """
 
-    columns: tuple
+    columns: tuple[np.ndarray, ...]
     size: int
 
     @staticmethod
-    def of(wireframe):
+    def of(wireframe: Wireframe) -> "Layout":
         """The Layout of a Wireframe."""
         columns, size = [], 3 * len(wireframe.vertices)
         for edge in wireframe.edges:
@@ -80,7 +87,7 @@ class Layout:
             size += own
         return Layout(tuple(columns), size)
 
-    def moved(self, wireframe, step):
+    def moved(self, wireframe: Wireframe, step: np.ndarray) -> Wireframe:
         """The Wireframe after a (size,) step."""
         vertices = wireframe.vertices + step[: 3 * len(wireframe.vertices)].reshape(-1, 3)
         edges = []
@@ -94,10 +101,13 @@ class Layout:
 class Equations:
     """Normal equations, block by block: the sum of weight |values + derivatives step|^2 is to be least."""
 
-    def __init__(self, size):
-        self.size, self.rows, self.columns, self.entries, self.target = size, [], [], [], np.zeros(size)
+    def __init__(self, size: int) -> None:
+        self.size, self.target = size, np.zeros(size)
+        self.rows: list[np.ndarray] = []
+        self.columns: list[np.ndarray] = []
+        self.entries: list[np.ndarray] = []
 
-    def add_block(self, unknowns, matrix, gradient):
+    def add_block(self, unknowns: np.ndarray, matrix: np.ndarray, gradient: np.ndarray) -> None:
         """A (k, k) matrix and (k,) gradient for (k,) unknowns, of which some may be the same."""
         rows, columns = np.meshgrid(unknowns, unknowns, indexing="ij")
         self.rows.append(rows.ravel())
@@ -105,11 +115,11 @@ class Equations:
         self.entries.append(matrix.ravel())
         np.add.at(self.target, unknowns, gradient)
 
-    def add(self, unknowns, values, slopes, weight):
+    def add(self, unknowns: np.ndarray, values: np.ndarray, slopes: np.ndarray, weight: float) -> None:
         """Values (m,) with their derivatives (m, k) by (k,) unknowns."""
         self.add_block(unknowns, weight * slopes.T @ slopes, weight * slopes.T @ values)
 
-    def matrix(self):
+    def matrix(self) -> csc_matrix:
         """Sparse (size, size)."""
         if not self.rows:
             return coo_matrix((self.size, self.size)).tocsc()
@@ -117,7 +127,7 @@ class Equations:
         return coo_matrix((entries, (rows, columns)), shape=(self.size, self.size)).tocsc()
 
 
-def solve(matrix, gradient, free):
+def solve(matrix: csc_matrix, gradient: np.ndarray, free: np.ndarray) -> np.ndarray:
     """The (size,) step to the minimum; 0 for the unknowns that are not free, (size,) bool."""
     step, unknowns = np.zeros(len(gradient)), np.flatnonzero(free)
     matrix = matrix[unknowns][:, unknowns]
@@ -138,10 +148,15 @@ class Problem:
     start: Wireframe
     layout: Layout
     pixel: float
-    relations: tuple = ()
+    relations: tuple[Constraint, ...] = ()
 
 
-def adjusted(wireframe, matching, relations=(), radii=RADII_PX):
+def adjusted(
+    wireframe: Wireframe,
+    matching: "EdgelMatching",
+    relations: Iterable[Constraint] = (),
+    radii: Sequence[float] = RADII_PX,
+) -> Wireframe:
     """The Wireframe whose edges agree best with the edgels of all views, without evidence (see `evidence.evidence_of`).
 
     matching: EdgelMatching. relations: Constraints. radii: px, one for each round.
@@ -156,7 +171,7 @@ def adjusted(wireframe, matching, relations=(), radii=RADII_PX):
     return _touching(_polished(problem, wireframe, image.matrix()))
 
 
-def image_equations(problem, wireframe, matching, radius):
+def image_equations(problem: Problem, wireframe: Wireframe, matching: "EdgelMatching", radius: float) -> Equations:
     """Equations of the edgels, the start and the free ends."""
     shapes, pixel = wireframe.shapes, problem.pixel
     support = support_of(matching, shapes, radius)
@@ -180,7 +195,7 @@ def image_equations(problem, wireframe, matching, radius):
     return equations
 
 
-def _counted(wireframe, samples, pixel):
+def _counted(wireframe: Wireframe, samples: EdgeSamples, pixel: float) -> np.ndarray:
     """(n,) float: 0 for samples too near to an end of their edge, or to a vertex that touches it; 1 otherwise."""
     counted = np.ones(len(samples))
     for number, edge in enumerate(wireframe.edges):
@@ -195,20 +210,22 @@ def _counted(wireframe, samples, pixel):
     return counted
 
 
-def _across(said, directions):
+def _across(said: "PlaneEquations", directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(n, 3, 3) matrices and (n, 3) gradients of PlaneEquations; what they say along the edge is left out."""
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     return across @ said.matrices @ across, (across @ said.gradients[:, :, None])[:, :, 0]
 
 
-def _add_places(equations, unknowns, slopes, matrices, gradients):
+def _add_places(
+    equations: Equations, unknowns: np.ndarray, slopes: np.ndarray, matrices: np.ndarray, gradients: np.ndarray
+) -> None:
     """Add what is said about (n,) places: matrices (n, 3, 3), gradients (n, 3); slopes (n, 3, k) by the unknowns."""
     flat = slopes.reshape(-1, len(unknowns))
     weighted = (matrices @ slopes).reshape(-1, len(unknowns))
     equations.add_block(unknowns, flat.T @ weighted, flat.T @ gradients.ravel())
 
 
-def _pin_free_ends(equations, wireframe, start, deviation):
+def _pin_free_ends(equations: Equations, wireframe: Wireframe, start: Wireframe, deviation: float) -> None:
     """A vertex in which a single edge ends, and which touches no other, does not move along that edge."""
     degrees = wireframe.degrees
     for edge in wireframe.edges:
@@ -220,18 +237,18 @@ def _pin_free_ends(equations, wireframe, start, deviation):
                 equations.add(unknowns, gone, along, 1.0 / deviation**2)
 
 
-def _ends(wireframe, number):
+def _ends(wireframe: Wireframe, number: int) -> np.ndarray | None:
     """(2, 3) vertices of an edge, None for a closed one."""
     vertices = wireframe.edges[number].vertices
     return wireframe.vertices[list(vertices)] if vertices else None
 
 
-def neighbors_of(wireframe, number):
+def neighbors_of(wireframe: Wireframe, number: int) -> list[tuple[Shape, Shape]]:
     """See `charts.neighbors`."""
     return neighbors(wireframe.edges[number].shape, _ends(wireframe, number))
 
 
-def _stepped(problem, wireframe, image):
+def _stepped(problem: Problem, wireframe: Wireframe, image: Equations) -> Wireframe:
     """The Wireframe after one step; edges that would flip or be lost stay where they are, and so do their ends.
 
     image: Equations at the Wireframe.
@@ -253,14 +270,14 @@ def _stepped(problem, wireframe, image):
     return wireframe
 
 
-def _is_lost(before, after, most):
+def _is_lost(before: Shape, after: Shape, most: float) -> bool:
     """Whether an edge has changed its length as only a flip does, or is farther away than `most`."""
     stretch = max(after.length, 1e-300) / max(before.length, 1e-300)
     moved_by = np.linalg.norm(after.at(PLACES) - before.at(PLACES), axis=1).max()
     return not (1.0 / MOST_STRETCH <= stretch <= MOST_STRETCH and moved_by <= most)
 
 
-def _polished(problem, wireframe, matrix):
+def _polished(problem: Problem, wireframe: Wireframe, matrix: csc_matrix) -> Wireframe:
     """The Wireframe moved to where the hard constraints hold exactly, by as little as `matrix` (of the edgels) says."""
     for _ in range(POLISHING):
         constraints = [c for c in (*contacts(wireframe, problem.pixel), *problem.relations) if c.hard]
@@ -272,7 +289,7 @@ def _polished(problem, wireframe, matrix):
     return wireframe
 
 
-def _touching(wireframe):
+def _touching(wireframe: Wireframe) -> Wireframe:
     """The Wireframe with the vertices that touch edges exactly on these."""
     for _ in range(POLISHING if len(wireframe.contacts) else 0):
         vertices = wireframe.vertices.copy()
@@ -283,7 +300,7 @@ def _touching(wireframe):
     return wireframe
 
 
-def with_vertices(wireframe, vertices):
+def with_vertices(wireframe: Wireframe, vertices: np.ndarray) -> Wireframe:
     """The Wireframe with its vertices moved to (V, 3), and its edges with them."""
     edges = []
     for edge in wireframe.edges:
@@ -294,9 +311,12 @@ def with_vertices(wireframe, vertices):
     return replace(wireframe, vertices=vertices, edges=tuple(edges))
 
 
-def constrained(layout, wireframe, constraints, hard=None):
+def constrained(
+    layout: Layout, wireframe: Wireframe, constraints: Iterable[Constraint], hard: float | None = None
+) -> Equations:
     """Equations of the constraints at a Wireframe. hard: by how much more they weigh than their deviations say."""
-    equations, described = Equations(layout.size), {}
+    equations = Equations(layout.size)
+    described: dict[tuple[int, Any], tuple[Any, list[tuple[Any, Any]]]] = {}
     for constraint in constraints:
         for number in constraint.edges:
             if (number, constraint.about) not in described:
@@ -311,49 +331,52 @@ def constrained(layout, wireframe, constraints, hard=None):
     return equations
 
 
-def _described(wireframe, number, about):
+def _described(
+    wireframe: Wireframe, number: int, about: Callable[[Shape], np.ndarray] | None
+) -> tuple[Any, list[tuple[Any, Any]]]:
     """An edge's shape and its neighbors, or what `about` gives of each."""
     shape, pairs = wireframe.edges[number].shape, neighbors_of(wireframe, number)
     return (about(shape), [(about(one), about(other)) for one, other in pairs]) if about else (shape, pairs)
 
 
-def _replaced(values, arguments, place, argument):
+def _replaced(values: Callable[..., np.ndarray], arguments: Sequence[Any], place: int, argument: Any) -> np.ndarray:
     """Values of some arguments, of which one has been replaced."""
     return values(*arguments[:place], argument, *arguments[place + 1 :])
 
 
-def smooth_joints(wireframe):
+def smooth_joints(wireframe: Wireframe) -> Iterator[Constraint]:
     """Constraints of the tangents of two edges, at least one of them curved, that alone meet in a vertex, smoothly."""
-    meeting, degrees = {}, wireframe.degrees
+    meeting: dict[int, list[tuple[int, int]]] = {}
     for number, edge in enumerate(wireframe.edges):
         for end, vertex in enumerate(edge.vertices):
             meeting.setdefault(vertex, []).append((number, end))
+    degrees = wireframe.degrees
     for vertex, pair in meeting.items():
         if len(pair) != 2 or degrees[vertex] != 2 or pair[0][0] == pair[1][0]:
             continue
         (one, end), (other, other_end) = pair
         shapes = wireframe.edges[one].shape, wireframe.edges[other].shape
         values = _turn(end, other_end)
-        off = np.linalg.norm(values(*shapes))
+        off = float(np.linalg.norm(values(*shapes)))
         if {shape.kind for shape in shapes} != {"line"} and off < SMOOTH:
             deviation = SMOOTH_DEVIATION * widening((off / (3 * SMOOTH_DEVIATION)) ** 2)
             yield Constraint((one, other), values, deviation)
 
 
-def _turn(end, other_end):
+def _turn(end: int, other_end: int) -> Callable[[Shape, Shape], np.ndarray]:
     """Function of two shapes: difference of the tangents where one ends and the other goes on."""
     sign = 1.0 if end != other_end else -1.0
 
-    def values(shape, other):
+    def values(shape: Shape, other: Shape) -> np.ndarray:
         ahead, on = shape.tangents(np.array([float(end)]))[0], other.tangents(np.array([float(other_end)]))[0]
         return ahead - sign * on
 
     return values
 
 
-def contacts(wireframe, pixel):
+def contacts(wireframe: Wireframe, pixel: float) -> Iterator[Constraint]:
     """Constraints of the vertices that touch edges. pixel: unit-cube units."""
-    ending = {}
+    ending: dict[int, tuple[int, int]] = {}
     for number, edge in enumerate(wireframe.edges):
         for end, vertex in enumerate(edge.vertices):
             ending.setdefault(vertex, (number, end))
@@ -364,11 +387,11 @@ def contacts(wireframe, pixel):
             yield Constraint((ending[vertex][0], number), values, CONTACT_PX * pixel, hard=True)
 
 
-def _offset(touched, end, parameters):
+def _offset(touched: Shape, end: int, parameters: np.ndarray) -> Callable[[Shape, Shape], np.ndarray]:
     """Function of two shapes: how far, across the other, the one ends from the place on the other."""
     sides = np.linalg.svd(touched.tangents(parameters))[2][1:]
 
-    def values(shape, other):
+    def values(shape: Shape, other: Shape) -> np.ndarray:
         return sides @ (shape.ends[end] - other.at(parameters)[0])
 
     return values

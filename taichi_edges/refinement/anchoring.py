@@ -8,19 +8,24 @@ the other views have to show the line as well, and of the lines that would expla
 anchors and views stays.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import csr_matrix
 
 from taichi_edges.arrays.columns import Columns
 from taichi_edges.arrays.ranges import ragged
-from taichi_edges.evidence.edge_support import support_of
+from taichi_edges.evidence.edge_support import Support, support_of
 from taichi_edges.evidence.lying import EdgelsAbout
-from taichi_edges.geometry.shapes import Line
-from taichi_edges.refinement.anchors import BEYOND_PX, anchors_of
-from taichi_edges.refinement.straight_runs import LEAST_LENGTH_PX, runs_of
+from taichi_edges.geometry.shapes import Line, Shape
+from taichi_edges.refinement.anchors import BEYOND_PX, Anchors, anchors_of
+from taichi_edges.refinement.straight_runs import LEAST_LENGTH_PX, Runs, runs_of
 from taichi_edges.views.cameras import Cameras
+
+if TYPE_CHECKING:
+    from taichi_edges.evidence.edgel_matching import EdgelMatching
 
 AGREEING_PX = 2.0  # from a line in space, an anchor on it
 APART_SHARE = 0.5  # of a run's length: anchors nearer to each other do not tell its slope in depth
@@ -38,25 +43,26 @@ ROUNDS = 3  # in which lines carry further ones
 REPEAT_PX = 1.5  # in space, between lines that are parts of one
 
 
-def anchored_lines(matching, shapes):
-    """Lines that meet known shapes and that the views show where these say. matching: EdgelMatching. list of Line.
+def anchored_lines(matching: "EdgelMatching", shapes: Sequence[Shape]) -> list[Line]:
+    """Lines that meet known shapes and that the views show where these say. matching: EdgelMatching.
 
     What is found in one round is an anchor in the next: the wall for the window's frame, the frame for its pane.
     """
     if not shapes:
         return []
     cameras, support = Cameras.of(matching.projections), support_of(matching, shapes)
-    runs, known = runs_of(matching.edgels, support.claims.owners < 0), list(shapes)
-    anchors = anchors_of(runs, known, cameras, matching.pixel)
+    runs = runs_of(matching.edgels, support.claims.owners < 0)
+    anchors = anchors_of(runs, shapes, cameras, matching.pixel)
+    lines: list[Line] = []
     for number in range(ROUNDS):
-        support = support_of(matching, known) if number else support
+        support = support_of(matching, [*shapes, *lines]) if number else support
         free = support.claims.owners < 0
         found = distinct(shown(matching, hypotheses(runs, anchors), free, seen_in(support)), matching, free)
         if not found:
             break
-        anchors = anchors.with_further(anchors_of(runs, found, cameras, matching.pixel), len(known))
-        known += found
-    return known[len(shapes) :]
+        anchors = anchors.with_further(anchors_of(runs, found, cameras, matching.pixel), len(shapes) + len(lines))
+        lines += found
+    return lines
 
 
 # ------------------------------------------------------------------------------------------------- lines in space
@@ -79,31 +85,32 @@ class Lines(Columns):
     sizes: np.ndarray
 
     @property
-    def ways(self):
+    def ways(self) -> np.ndarray:
         """(n, 3) from the first anchor to the second."""
         return self.points[:, 1] - self.points[:, 0]
 
     @property
-    def ends(self):
+    def ends(self) -> np.ndarray:
         """(n, 2, 3)."""
         return self.points[:, :1] + self.extents[:, :, None] * self.ways[:, None]
 
     @property
-    def at_anchors(self):
+    def at_anchors(self) -> np.ndarray:
         """(n, 2) bool: is an end as near to its anchor as edges are that meet?"""
         off = np.abs(self.extents - [0.0, 1.0]) * np.linalg.norm(self.ways, axis=1)[:, None]
         return off <= BEYOND_PX * self.sizes[:, None]
 
     @property
-    def lengths(self):
+    def lengths(self) -> np.ndarray:
         """(n,) unit-cube units."""
         return (self.extents[:, 1] - self.extents[:, 0]) * np.linalg.norm(self.ways, axis=1)
 
 
-def hypotheses(runs, anchors):
+def hypotheses(runs: Runs, anchors: Anchors) -> Lines:
     """The Lines through pairs of anchors of Runs with which most others agree, at most TRIED for each run."""
     counts = np.bincount(anchors.runs, minlength=len(runs))
-    starts, several = np.cumsum(counts) - counts, []
+    starts = np.cumsum(counts) - counts
+    several: list[Lines] = []
     for count in range(2, MOST_ANCHORS + 1):
         chosen = np.flatnonzero(counts == count if count < MOST_ANCHORS else counts >= count)
         share = np.arange(count) / (count - 1)
@@ -112,7 +119,7 @@ def hypotheses(runs, anchors):
     return Lines.joined(several)
 
 
-def proposed(runs, anchors):
+def proposed(runs: Runs, anchors: Anchors) -> list[Lines]:
     """Lists of Lines for r Runs with c anchors each. anchors: Anchors with arrays (r, c, ..)."""
     lengths, points, ways, sizes = runs.lengths, anchors.points, anchors.ways, anchors.sizes
     first, second = np.triu_indices(points.shape[1], 1)
@@ -136,7 +143,7 @@ def proposed(runs, anchors):
     return found
 
 
-def on_lines(points, first, second, sizes):
+def on_lines(points: np.ndarray, first: np.ndarray, second: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """(r, p, c) bool: do anchors, (r, c, 3), lie on the lines through pairs of them? sizes: (r, c) of a pixel."""
     start, way = points[:, first], points[:, second] - points[:, first]
     way = way / np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-300)
@@ -145,7 +152,7 @@ def on_lines(points, first, second, sizes):
     return np.linalg.norm(offsets, axis=3) <= AGREEING_PX * sizes[:, None]
 
 
-def extents_of(lengths, ways, sizes):
+def extents_of(lengths: np.ndarray, ways: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(r, 2) parameters of the ends of runs on lines in space, and (r,) bool, whether they are in front of the camera.
 
     lengths: (r,) px. ways: (r, 2) px along the run of the places with parameter 0 and 1. sizes: (r, 2) of a pixel
@@ -176,7 +183,7 @@ class Sight:
     seen: np.ndarray
 
     @staticmethod
-    def of(matching, lines, free, spacing):
+    def of(matching: "EdgelMatching", lines: Lines, free: np.ndarray, spacing: float) -> "Sight":
         """spacing: px. free: (e,) bool, the edgels that count."""
         counts = np.maximum(np.round(lines.lengths / (spacing * lines.sizes)), 4).astype(np.int64)
         owners, number = ragged(counts)
@@ -189,20 +196,20 @@ class Sight:
         edgels = np.where(np.append(free, False)[about.edgels], about.edgels, -1)
         return Sight(owners, parameters, edgels, about.inside)
 
-    def shares(self, count):
+    def shares(self, count: int) -> np.ndarray:
         """(L, V) share of the places of each of the lines that a view has and shows; of them all."""
         total = np.bincount(self.lines, minlength=count)[:, None]
         shown = [np.bincount(self.lines, column, count) for column in (self.edgels >= 0).T]
         return np.stack(shown, axis=1) / np.maximum(total, 1)
 
 
-def seen_in(support):
+def seen_in(support: Support) -> np.ndarray:
     """(S, V) bool: does a view show a shape, on half of its length? support: Support of the shapes."""
     lengths = support.samples.lengths[:, None]
     return support.samples.sums(lengths * (support.edgels >= 0)) >= 0.5 * support.samples.sums(lengths)
 
 
-def shown(matching, lines, free, seen):
+def shown(matching: "EdgelMatching", lines: Lines, free: np.ndarray, seen: np.ndarray) -> Lines:
     """The Lines that enough views show, cut to where they do. free: (e,) bool, the edgels that no known shape has.
 
     seen: (S, V) bool, which views show which shapes. A view that shows both shapes on which a line is anchored should
@@ -219,7 +226,7 @@ def shown(matching, lines, free, seen):
     return lines.keep(agreed & (views.sum(axis=1) >= LEAST_VIEWS))
 
 
-def clipped(lines, sight, enough):
+def clipped(lines: Lines, sight: Sight, enough: np.ndarray) -> tuple[Lines, np.ndarray]:
     """The Lines cut to where most places are shown by enough views, (m,) bool, and (n,) bool, whether that is a line.
 
     Of all stretches the one with the greatest surplus of places that are shown over SHOWN of them.
@@ -243,7 +250,7 @@ def clipped(lines, sight, enough):
 # ------------------------------------------------------------------------------------------------- each edge once
 
 
-def distinct(lines, matching, free):
+def distinct(lines: Lines, matching: "EdgelMatching", free: np.ndarray) -> list[Line]:
     """A list of Line that several views propose. Each edgel is on one, the best founded one, which its repeats extend.
 
     free: (e,) bool, the edgels that no known shape has.
@@ -286,7 +293,7 @@ class Ballot:
     rivals: np.ndarray
 
     @staticmethod
-    def of(lines, sight, count):
+    def of(lines: Lines, sight: Sight, count: int) -> "Ballot":
         """sight: of the Lines. count: of edgels."""
         place, view = np.nonzero(sight.edgels >= 0)
         shape, entries = (len(lines), count), np.ones(len(place), np.int32)
@@ -304,18 +311,18 @@ class Ballot:
         return Ballot(votes, worth, rivals)
 
     @property
-    def elected(self):
+    def elected(self) -> np.ndarray:
         """(n,) bool: the lines that enough views propose, and that no other one for their edgels beats."""
         return (self.votes >= LEAST_VOTES) & (self.worth >= LEAST_WORTH) & (self.worth >= self.rivals)
 
 
-def voters(lines, views, count):
+def voters(lines: np.ndarray, views: np.ndarray, count: int) -> np.ndarray:
     """(count,) number of different views that are paired with each of the lines."""
     pairs = np.unique(np.column_stack([lines, views]), axis=0)
     return np.bincount(pairs[:, 0], minlength=count)
 
 
-def beside(lines, chosen, points):
+def beside(lines: Lines, chosen: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(k, m) parameters on chosen Lines, (k,), of points (k, m, 3), and (k,) how far these are from them at most."""
     way, offsets = lines.ways[chosen][:, None], points - lines.points[chosen, :1]
     along = (offsets * way).sum(axis=2) / (way**2).sum(axis=2)

@@ -1,12 +1,19 @@
 """Where straight 2D runs of edgels meet edges whose place is known: anchors, which give the runs their depth."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from taichi_edges.arrays.columns import Columns
 from taichi_edges.arrays.ranges import ragged
+from taichi_edges.geometry.shapes import Shape
+
+if TYPE_CHECKING:
+    from taichi_edges.refinement.straight_runs import Runs
+    from taichi_edges.views.cameras import Cameras
 
 BEYOND_PX = 8.0  # between the ends of edges that meet, see `junctions.REACH_PX`
 LEAST_CROSSING = 0.3  # sine of the angle in the image at which an anchor is met
@@ -28,16 +35,16 @@ class Anchors(Columns):
     ways: np.ndarray
     sizes: np.ndarray
 
-    def sorted(self):
+    def sorted(self) -> "Anchors":
         """The same in order of their runs, and along these."""
         return self.keep(np.lexsort((self.ways, self.runs)))
 
-    def with_further(self, others, count):
+    def with_further(self, others: "Anchors", count: int) -> "Anchors":
         """These and the other Anchors, those on further shapes, where there are `count` shapes so far."""
         return Anchors.joined([self, replace(others, shapes=others.shapes + count)]).sorted()
 
 
-def anchors_of(runs, shapes, cameras, pixel):
+def anchors_of(runs: "Runs", shapes: Sequence[Shape], cameras: "Cameras", pixel: float) -> Anchors:
     """The Anchors of Runs on shapes. pixel: unit-cube units."""
     pieces = pieces_of(shapes, pixel)
     found, piece = near_pairs(runs, pieces, cameras)
@@ -62,7 +69,7 @@ def anchors_of(runs, shapes, cameras, pixel):
     return once(anchors)
 
 
-def once(anchors):
+def once(anchors: Anchors) -> Anchors:
     """The Anchors sorted by run and place along it, without those that two pieces of one shape share."""
     order = np.lexsort((anchors.ways, anchors.shapes, anchors.runs))
     anchors = anchors.keep(order)
@@ -83,7 +90,7 @@ class Pieces:
     shapes: np.ndarray
 
 
-def pieces_of(shapes, pixel):
+def pieces_of(shapes: Sequence[Shape], pixel: float) -> Pieces:
     """The Pieces of shapes; lines and arcs go on a little beyond their ends."""
     points, halves, counts = [np.zeros((0, 3))], [np.zeros((0, 3))], []
     for shape in shapes:
@@ -96,7 +103,7 @@ def pieces_of(shapes, pixel):
     return Pieces(np.concatenate(points), np.concatenate(halves), np.repeat(np.arange(len(shapes)), counts))
 
 
-def near_pairs(runs, pieces, cameras):
+def near_pairs(runs: "Runs", pieces: Pieces, cameras: "Cameras") -> tuple[np.ndarray, np.ndarray]:
     """(k,) runs and (k,) pieces that come close to each other in the run's view, each pair once."""
     found, piece = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     every = np.arange(len(pieces.points))
@@ -113,7 +120,7 @@ def near_pairs(runs, pieces, cameras):
     return np.concatenate(found), np.concatenate(piece)
 
 
-def places_on(runs, chosen):
+def places_on(runs: "Runs", chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(m, 2) px places on the chosen runs, some beyond their ends, and (m,) the run of each."""
     counts = np.ceil((runs.lengths[chosen] + 2 * BEYOND_PX) / PLACE_PX).astype(np.int64) + 1
     of, number = ragged(counts)

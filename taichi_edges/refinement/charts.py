@@ -12,30 +12,35 @@ spline          3 for each inner control point next to a joint or an end; joints
 all of them 0 where the shape is, and in units of length: a unit moves the shape about as far.
 """
 
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
 import numpy as np
 
-from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
+from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline
 
 STEP = 1e-6  # unit-cube units, of the differences that derivatives are; the square of 1e-5 of a pixel
 FLATTEST = 1e-7  # sagitta of an arc over half its chord
 CHORDS, NEWTON = 32, 8  # of each cubic, where the nearest place is looked for first; and rounds until it is found
 
+Described = TypeVar("Described")
 
-def own_unknowns(shape):
+
+def own_unknowns(shape: Shape) -> int:
     """How many unknowns a shape has beside its ends."""
-    if shape.kind == "spline":
+    if isinstance(shape, Spline):
         return 6 * len(shape.curves)
     return {"line": 0, "arc": 2, "circle": 6, "elliptic_arc": 4, "ellipse": 9}[shape.kind]
 
 
-def moved(shape, ends, own):
+def moved(shape: Shape, ends: np.ndarray | None, own: np.ndarray) -> Shape:
     """The shape that ends in (2, 3) `ends` (a closed one: None), with its own unknowns at (k,) `own`."""
     if shape.kind == "line":
         return Line(np.array(ends))
     return MOVES[shape.kind](shape, ends, own)
 
 
-def neighbors(shape, ends):
+def neighbors(shape: Shape, ends: np.ndarray | None) -> list[tuple[Shape, Shape]]:
     """A shape with each of its unknowns a STEP ahead and a STEP behind: list of pairs of shapes.
 
     ends: (2, 3), the first six unknowns; None for a closed shape.
@@ -43,18 +48,20 @@ def neighbors(shape, ends):
     fixed = 0 if ends is None else 6
     start = np.concatenate([np.zeros(0) if ends is None else np.ravel(ends), np.zeros(own_unknowns(shape))])
 
-    def at(unknowns):
+    def at(unknowns: np.ndarray) -> Shape:
         return moved(shape, unknowns[:6].reshape(2, 3) if fixed else None, unknowns[fixed:])
 
     return [(at(start + step), at(start - step)) for step in STEP * np.eye(len(start))]
 
 
-def derivatives(pairs, evaluated):
+def derivatives(
+    pairs: Sequence[tuple[Described, Described]], evaluated: Callable[[Described], np.ndarray]
+) -> np.ndarray:
     """Derivatives (..., k) by the unknowns of what `evaluated`, a function of a shape, gives. pairs: the neighbors."""
     return np.stack([(evaluated(ahead) - evaluated(behind)) / (2 * STEP) for ahead, behind in pairs], axis=-1)
 
 
-def nearest_parameters(shape, points):
+def nearest_parameters(shape: Shape, points: np.ndarray) -> np.ndarray:
     """(n,) parameters, 0 to 1, of the places on a shape that are nearest to (n, 3) points."""
     grid = np.linspace(0.0, 1.0, CHORDS * len(shape.cubics()) + 1)
     apart = np.linalg.norm(points[:, None] - shape.at(grid), axis=2)
@@ -68,7 +75,7 @@ def nearest_parameters(shape, points):
     return parameters
 
 
-def _moved_arc(arc, ends, own):
+def _moved_arc(arc: EllipticArc, ends: np.ndarray, own: np.ndarray) -> EllipticArc:
     """Through the ends, with a sagitta that is orthogonal to their chord."""
     (start, end), middle = ends, 0.5 * (arc.low + arc.high)
     outward = np.cos(middle) * arc.axes[0] + np.sin(middle) * arc.axes[1]
@@ -87,7 +94,7 @@ def _moved_arc(arc, ends, own):
     return EllipticArc(centre, radius * np.array([outward, along]), -turn, turn)
 
 
-def _moved_circle(circle, ends, own):
+def _moved_circle(circle: EllipticArc, ends: None, own: np.ndarray) -> EllipticArc:
     """Moved, tilted about its two axes and scaled."""
     radius = circle.radii.mean()
     rotation = _rotation((own[3:5] / radius) @ circle.axes / radius)
@@ -96,7 +103,7 @@ def _moved_circle(circle, ends, own):
     )
 
 
-def _rotation(vector):
+def _rotation(vector: np.ndarray) -> np.ndarray:
     """(3, 3) rotation about `vector` by its length, radians (Rodrigues)."""
     angle = np.sqrt(vector @ vector)
     if angle == 0.0:
@@ -106,7 +113,7 @@ def _rotation(vector):
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def _moved_elliptic_arc(arc, ends, own):
+def _moved_elliptic_arc(arc: EllipticArc, ends: np.ndarray, own: np.ndarray) -> EllipticArc:
     """With half the angle it spans h: centre + u cos t + v sin t, t from -h to h, through ends and middle."""
     half, middle = 0.5 * (arc.high - arc.low), arc.at(np.array([0.5]))[0]
     half = 2 * np.arctan(np.tan(0.5 * half) * np.exp(own[3] / arc.radii.mean()))  # stays between 0 and a half turn
@@ -117,13 +124,13 @@ def _moved_elliptic_arc(arc, ends, own):
     return EllipticArc.conjugate(middle - outward, (outward, across), -half, half)
 
 
-def _moved_ellipse(ellipse, ends, own):
+def _moved_ellipse(ellipse: EllipticArc, ends: None, own: np.ndarray) -> EllipticArc:
     """Centre and half diameters moved."""
     diameters = ellipse.axes + own[3:].reshape(2, 3)
     return EllipticArc.conjugate(ellipse.centre + own[:3], diameters, ellipse.low, ellipse.high)
 
 
-def _moved_spline(spline, ends, own):
+def _moved_spline(spline: Spline, ends: np.ndarray | None, own: np.ndarray) -> Spline:
     """Inner control points moved; a joint divides the leg between its neighbours as it did before."""
     curves = spline.curves.copy()
     count = len(curves)
@@ -140,7 +147,7 @@ def _moved_spline(spline, ends, own):
     return Spline(curves, spline.closed)
 
 
-MOVES = {
+MOVES: dict[str, Callable[[Any, Any, np.ndarray], Shape]] = {  # each for the shapes of its kind alone
     "arc": _moved_arc,
     "circle": _moved_circle,
     "elliptic_arc": _moved_elliptic_arc,

@@ -4,14 +4,20 @@ Points are thinned out and clustered, and an edge of a few pixels has hardly any
 the other edges that meet there, nothing is left to guess: the edgels between them, which no other edge owns, decide.
 """
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.spatial import cKDTree
 
-from taichi_edges.evidence.edge_support import claims_of, support_along
+from taichi_edges.evidence.edge_support import Claims, claims_of, support_along
 from taichi_edges.evidence.lying import EdgelsAbout, steadiness
 from taichi_edges.fitting.distances import distances_to
-from taichi_edges.geometry.shapes import Line, bounds_of, near_bounds
+from taichi_edges.geometry.shapes import Line, Shape, bounds_of, near_bounds
 from taichi_edges.geometry.wireframe import Edge, Wireframe
+
+if TYPE_CHECKING:
+    from taichi_edges.evidence.edgel_matching import EdgelMatching
 
 LONGEST_PX = 60.0  # a longer edge has points of its own
 SHORTEST_PX = 4.0
@@ -22,7 +28,7 @@ STEADY = 0.6  # a contour that passes by at random lies on the line a sixth of t
 MOST_PAIRS = 20_000  # the nearest ones, so that a large scene does not take long
 
 
-def completed(wireframe, matching):
+def completed(wireframe: Wireframe, matching: "EdgelMatching") -> tuple[Wireframe, int]:
     """The Wireframe with the missing lines, and how many there were. matching: EdgelMatching."""
     pairs = open_pairs(wireframe, matching.pixel)
     if not len(pairs):
@@ -46,14 +52,14 @@ def completed(wireframe, matching):
     return Wireframe(wireframe.vertices, tuple(edges), wireframe.contacts), len(edges) - len(wireframe)
 
 
-def repeats(line, shapes, pixel):
+def repeats(line: Line, shapes: Sequence[Shape], pixel: float) -> bool:
     """Does a line lie within a pixel of some edge on its whole length? An edge that is not adjusted yet may be off."""
     places = line.at(np.linspace(0.0, 1.0, 5))
     near = near_bounds(bounds_of(shapes), places, pixel)
     return any((distances_to(shapes[number], places) <= pixel).all() for number in near)
 
 
-def steadiness_of_line(matching, line, places, claims):
+def steadiness_of_line(matching: "EdgelMatching", line: Line, places: np.ndarray, claims: Claims) -> float:
     """Share of the edgels about a line, of those that nothing else explains, that lie on it.
 
     A chord across a rounded corner is followed by the occluding contour in some views, and missed by it in others.
@@ -63,7 +69,7 @@ def steadiness_of_line(matching, line, places, claims):
     return steadiness((free & found.within(ON_PX)).sum(), free.sum())
 
 
-def open_pairs(wireframe, pixel):
+def open_pairs(wireframe: Wireframe, pixel: float) -> np.ndarray:
     """(k, 2) pairs of vertices that are near each other, in which edges meet, and that no edge joins."""
     pairs = cKDTree(wireframe.vertices).query_pairs(LONGEST_PX * pixel, output_type="ndarray")
     lengths = np.linalg.norm(wireframe.vertices[pairs[:, 0]] - wireframe.vertices[pairs[:, 1]], axis=1)
@@ -74,7 +80,7 @@ def open_pairs(wireframe, pixel):
     return pairs[good][order][:MOST_PAIRS]
 
 
-def clear_places(line, pixel):
+def clear_places(line: Line, pixel: float) -> np.ndarray:
     """(n,) parameters a pixel apart, clear of the ends of a line."""
     margin = min(CLEAR_PX * pixel / line.length, 0.3)
     return np.linspace(margin, 1 - margin, max(int(line.length / pixel * (1 - 2 * margin)), 2) + 1)

@@ -5,6 +5,7 @@ smoothly form a path, and the path is cut anew into as few shapes as pay (`model
 over all ways to cut it. A stroke that lies beside others on its whole length repeats them.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, replace
 from itertools import chain
 
@@ -13,9 +14,9 @@ from scipy.spatial import cKDTree
 
 from taichi_edges.fitting.arcs import fit_arc, through_three
 from taichi_edges.fitting.distances import distances_to, unit
-from taichi_edges.fitting.model_selection import Track, best_shape, misfit, observations, track_of
+from taichi_edges.fitting.model_selection import Track, Yardstick, best_shape, misfit, observations, track_of
 from taichi_edges.fitting.prices import price_of
-from taichi_edges.geometry.shapes import EllipticArc, Line, Spline, bounds_of, near_bounds
+from taichi_edges.geometry.shapes import EllipticArc, Shape, bounds_of, near_bounds
 
 BESIDE = 3.0  # noises: places so near to a shape are on it
 PARALLEL = np.cos(np.radians(20.0))
@@ -35,6 +36,9 @@ GAP_SEEN = 0.25  # a place is shown by this share of the views that see the stro
 LEAST_GAP_VIEWS = 1.0  # and by one at least
 REPEATED = 0.9  # of the places of a stroke beside others, from which on it says nothing new
 
+Seen = Callable[[Shape, np.ndarray], np.ndarray]  # (n,) how many views see a shape at (n,) parameters
+End = tuple[int, int]  # number of the shape, side 0 or 1
+
 
 @dataclass(frozen=True)
 class Merging:
@@ -44,7 +48,7 @@ class Merging:
     joined: int = 0
     duplicates: int = 0
 
-    def __add__(self, other):
+    def __add__(self, other: "Merging") -> "Merging":
         pairs = zip(astuple(self), astuple(other), strict=True)
         return Merging(*(one + more for one, more in pairs))
 
@@ -53,11 +57,13 @@ class Merging:
 class Stroke:
     """A shape, and the Track of places by which it is compared with others."""
 
-    shape: Line | EllipticArc | Spline
+    shape: Shape
     track: Track
 
 
-def continued(shapes, yardstick, seen, gap_px=JOINT_GAP_PX):
+def continued(
+    shapes: Sequence[Shape], yardstick: Yardstick, seen: Seen, gap_px: float = JOINT_GAP_PX
+) -> tuple[list[Shape], Merging]:
     """The shapes after all three passes, and Merging.
 
     shapes: list of shapes in the unit cube. yardstick: Yardstick. seen: function of a shape and (n,) parameters that
@@ -73,23 +79,20 @@ def continued(shapes, yardstick, seen, gap_px=JOINT_GAP_PX):
 # --------------------------------------------------------------------------------------------------- whole circles
 
 
-def with_whole_circles(shapes, yardstick, seen):
+def with_whole_circles(shapes: Sequence[Shape], yardstick: Yardstick, seen: Seen) -> tuple[list[Shape], int]:
     """The shapes, arcs replaced by the circle they are parts of where that goes on; and how many circles that gave."""
-    shapes, circles = list(shapes), []
-    waiting = sorted((n for n, shape in enumerate(shapes) if shape.kind == "arc"), key=lambda n: -shapes[n].length)
-    if not waiting:
-        return shapes, 0
+    arcs = {n: shape for n, shape in enumerate(shapes) if isinstance(shape, EllipticArc) and shape.kind == "arc"}
+    if not arcs:
+        return list(shapes), 0
+    circles: list[Shape] = []
+    gone: set[int] = set()
     strokes = [Stroke(shape, track_of(shape, yardstick.pixel)) for shape in shapes]
-    places, gone, alive = (
-        Places([stroke.track for stroke in strokes]),
-        set(),
-        np.array([not shape.closed for shape in shapes]),
-    )
-    for number in waiting:
+    places, alive = Places([stroke.track for stroke in strokes]), np.array([not shape.closed for shape in shapes])
+    for number in sorted(arcs, key=lambda n: -arcs[n].length):
         if number in gone:
             continue
         alive[list(gone)] = False
-        circle = circle_around(shapes[number], places, alive, yardstick)
+        circle = circle_around(arcs[number], places, alive, yardstick)
         if circle is None:
             continue
         others = np.unique(places.owners[places.about(circle, BESIDE * yardstick.noise, alive)]).tolist()
@@ -110,14 +113,14 @@ class Places:
     longest of these of each Track.
     """
 
-    def __init__(self, tracks):
+    def __init__(self, tracks: Sequence[Track]) -> None:
         self.points = np.concatenate([track.points for track in tracks])
         self.shares = np.concatenate([track.share for track in tracks])
         self.owners = np.repeat(np.arange(len(tracks)), [len(track.points) for track in tracks])
         self.longest = np.array([track.share.max() for track in tracks])
         self.tree, self.box = cKDTree(self.points), (self.points.min(axis=0), self.points.max(axis=0))
 
-    def about(self, circle, margin, alive):
+    def about(self, circle: Shape, margin: float, alive: np.ndarray) -> np.ndarray:
         """Indices, ascending, of the places within `margin` of a circle, of the Tracks that are `alive`, (T,) bool."""
         step = max(AROUND * margin, circle.length / MOST_BALLS)
         reach = margin + 0.5 * step
@@ -129,19 +132,21 @@ class Places:
         return around[distances_to(circle, self.points[around]) <= margin]
 
 
-def circle_around(shape, places, alive, yardstick):
+def circle_around(shape: EllipticArc, places: Places, alive: np.ndarray, yardstick: Yardstick) -> Shape | None:
     """The whole circle of an arc, fitted to all the places that lie on it; None where it runs away from the arc.
 
     places: Places of all Tracks, of which those that are `alive`, (T,) bool, count.
     """
     middle = shape.low + 0.5 * (shape.high - shape.low)
-    circle, longest = shape.over(middle - np.pi, middle + np.pi), places.longest[alive].max()
+    circle: Shape = shape.over(middle - np.pi, middle + np.pi)
+    longest = places.longest[alive].max()
     for width in (3.0, 2.0, 1.0, 1.0):
         tolerance = width * BESIDE * yardstick.noise
         near = places.about(circle, tolerance, alive)
         if len(near) < 6:
             return None
         arc = through_three(*circle.at(np.array([0.25, 0.5, 0.75])))
+        assert arc is not None  # places on a circle are on no line
         points, shares = places.points[near], places.shares[near] / longest
         arc = fit_arc(arc, points, np.broadcast_to(arc.tangent, points.shape), 0.0, tolerance, False, shares=shares)
         if not 0.5 < arc.curvature * shape.radii[0] < 2.0:
@@ -150,7 +155,7 @@ def circle_around(shape, places, alive, yardstick):
     return circle
 
 
-def goes_on(shape, places, yardstick, seen, least=0.0):
+def goes_on(shape: Shape, places: np.ndarray, yardstick: Yardstick, seen: Seen, least: float = 0.0) -> bool:
     """Do strokes, and the images between them, show the whole shape? places: (n, 3) points of strokes on it.
 
     least: share of the shape that the strokes must cover.
@@ -165,7 +170,7 @@ def goes_on(shape, places, yardstick, seen, least=0.0):
     return (views[~covered] >= max(GAP_SEEN * usual, LEAST_GAP_VIEWS)).mean() >= GAP_SHOWN
 
 
-def is_cheaper(shape, parts, yardstick):
+def is_cheaper(shape: Shape, parts: Sequence[Stroke], yardstick: Yardstick) -> bool:
     """Does a shape describe what its parts, Strokes, describe at less cost (BIC)?"""
     points, share = (np.concatenate([getattr(part.track, name) for part in parts]) for name in ("points", "share"))
     price = np.log(observations(share, yardstick))
@@ -173,7 +178,7 @@ def is_cheaper(shape, parts, yardstick):
     return price * price_of(shape) + misfit(distances_to(shape, points), share, yardstick) < before
 
 
-def on_shape(shape, track, yardstick):
+def on_shape(shape: Shape, track: Track, yardstick: Yardstick) -> np.ndarray:
     """(n,) bool: the places of a Track that lie on a shape and run along it."""
     near = distances_to(shape, track.points) <= BESIDE * yardstick.noise
     if near.any():
@@ -188,9 +193,10 @@ def on_shape(shape, track, yardstick):
 # ---------------------------------------------------------------------------------------------------- smooth paths
 
 
-def rejoined(shapes, yardstick, seen, gap_px=JOINT_GAP_PX):
+def rejoined(shapes: Sequence[Shape], yardstick: Yardstick, seen: Seen, gap_px: float = JOINT_GAP_PX) -> list[Shape]:
     """The shapes, each path of strokes that continue each other cut anew into as few as pay."""
-    whole, spacing = [], SPACING_PX * yardstick.pixel
+    whole: list[Shape] = []
+    spacing = SPACING_PX * yardstick.pixel
     for path, closes in smooth_paths(shapes, yardstick, gap_px):
         strokes = [Stroke(shapes[n], oriented(track_of(shapes[n], spacing), backward)) for n, backward in path]
         loop = closed_shape(strokes, yardstick, seen) if closes else None
@@ -198,7 +204,7 @@ def rejoined(shapes, yardstick, seen, gap_px=JOINT_GAP_PX):
     return whole
 
 
-def closed_shape(strokes, yardstick, seen):
+def closed_shape(strokes: Sequence[Stroke], yardstick: Yardstick, seen: Seen) -> Shape | None:
     """The closed shape of Strokes that follow each other back to the first one, or None where none is cheaper."""
     track = replace(joined_track(strokes), closed=True)
     count = observations(track.share, yardstick)
@@ -207,19 +213,23 @@ def closed_shape(strokes, yardstick, seen):
     return shape if shape is not None and replaces(shape, strokes, yardstick, seen) else None
 
 
-def smooth_paths(shapes, yardstick, gap_px):
+def smooth_paths(
+    shapes: Sequence[Shape], yardstick: Yardstick, gap_px: float
+) -> list[tuple[list[tuple[int, bool]], bool]]:
     """Lists of (index, reversed) of strokes that continue each other, and whether they come back to their start.
 
     Every shape is in one of them.
     """
     partner = stroke_joints(shapes, yardstick, gap_px)
-    paths, seen = [], set()
+    paths: list[tuple[list[tuple[int, bool]], bool]] = []
+    seen: set[int] = set()
     ends = [(number, side) for number, shape in enumerate(shapes) for side in (0, 1)]
     starts = [end for end in ends if end not in partner] + ends  # open paths first, then what goes round
     for number, side in starts:
         if number in seen:
             continue
-        path, start, onward = [], (number, side), (number, side)
+        path, start = [], (number, side)
+        onward: End | None = start
         while onward is not None and onward[0] not in seen:
             number, side = onward
             seen.add(number)
@@ -229,7 +239,7 @@ def smooth_paths(shapes, yardstick, gap_px):
     return paths
 
 
-def stroke_joints(shapes, yardstick, gap_px):
+def stroke_joints(shapes: Sequence[Shape], yardstick: Yardstick, gap_px: float) -> dict[End, End]:
     """{(shape, side): (shape, side)} of ends that continue each other, each the best for the other."""
     ends = [(number, side) for number, shape in enumerate(shapes) if not shape.closed for side in (0, 1)]
     if len(ends) < 2:
@@ -248,14 +258,14 @@ def stroke_joints(shapes, yardstick, gap_px):
             turn = np.arccos(np.clip(-outward[i] @ outward[j], -1, 1))
             ahead = abs(step @ along) / (4 * yardstick.pixel)
             found.append((aside / yardstick.noise + turn / np.radians(5.0) + ahead, i, j))
-    partner = {}
+    partner: dict[End, End] = {}
     for _, i, j in sorted(found):
         if ends[i] not in partner and ends[j] not in partner:
             partner[ends[i]], partner[ends[j]] = ends[j], ends[i]
     return partner
 
 
-def cut_anew(strokes, yardstick, seen):
+def cut_anew(strokes: Sequence[Stroke], yardstick: Yardstick, seen: Seen) -> list[Shape]:
     """The shapes that describe a path of Strokes with the least cost (BIC), each over a run of them.
 
     strokes: in the order of the path, their Tracks in its direction.
@@ -280,7 +290,7 @@ def cut_anew(strokes, yardstick, seen):
     return cut[::-1]
 
 
-def replaces(shape, strokes, yardstick, seen):
+def replaces(shape: Shape, strokes: Sequence[Stroke], yardstick: Yardstick, seen: Seen) -> bool:
     """Does the shape say most of what each of the Strokes says, and do the images show it in between?
 
     Without the former, a short stroke could be explained away by long ones.
@@ -291,7 +301,7 @@ def replaces(shape, strokes, yardstick, seen):
     return goes_on(shape, np.concatenate([stroke.track.points for stroke in strokes]), yardstick, seen)
 
 
-def oriented(track, backward):
+def oriented(track: Track, backward: bool) -> Track:
     """A Track run the other way round if `backward`."""
     if not backward:
         return track
@@ -299,9 +309,10 @@ def oriented(track, backward):
     return Track(track.points[::-1], length - track.arc[::-1], track.share[::-1], track.closed)
 
 
-def joined_track(strokes):
+def joined_track(strokes: Sequence[Stroke]) -> Track:
     """One Track of Strokes that follow each other; where they overlap, places are in the order of the path."""
-    tracks, arcs, offset, before = [stroke.track for stroke in strokes], [], 0.0, None
+    tracks, offset, before = [stroke.track for stroke in strokes], 0.0, None
+    arcs: list[np.ndarray] = []
     for track in tracks:
         if before is not None:
             heading = unit(before.points[-1] - before.points[-2])
@@ -319,9 +330,10 @@ def joined_track(strokes):
 # --------------------------------------------------------------------------------------------------------- repeats
 
 
-def without_repeats(shapes, yardstick):
+def without_repeats(shapes: Sequence[Shape], yardstick: Yardstick) -> list[Shape]:
     """The shapes without those that lie beside longer ones on their whole length."""
-    kept, bounds = set(), bounds_of(shapes)
+    kept: set[int] = set()
+    bounds = bounds_of(shapes)
     for number in sorted(range(len(shapes)), key=lambda number: -shapes[number].length):
         track = track_of(shapes[number], yardstick.pixel)
         near = kept & set(near_bounds(bounds, track.points, BESIDE * yardstick.noise).tolist())
@@ -331,6 +343,6 @@ def without_repeats(shapes, yardstick):
     return [shapes[number] for number in sorted(kept)]
 
 
-def beside_others(track, shapes, yardstick):
+def beside_others(track: Track, shapes: Sequence[Shape], yardstick: Yardstick) -> np.ndarray:
     """(n,) bool: the places of a Track that lie on one of the shapes and run along it."""
     return np.any([on_shape(shape, track, yardstick) for shape in shapes], axis=0)

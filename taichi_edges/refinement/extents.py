@@ -1,18 +1,22 @@
 """How far edges go: free ends move on as far as the images show the edge, and no farther."""
 
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from taichi_edges.geometry.shapes import Line
-from taichi_edges.refinement.continuation import GAP_SEEN, LEAST_GAP_VIEWS
+from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline
+from taichi_edges.refinement.continuation import GAP_SEEN, LEAST_GAP_VIEWS, Seen
 
 AHEAD_PX = 40.0  # looked beyond an end; a longer way takes another round
 LOST_PX = 4.0  # an edge that the images do not show for so long has ended
 ROUNDS = 4
 
+Question = tuple[Shape, np.ndarray]  # a shape, and (n,) parameters of places on it
 
-def extended(shape, sides, seen, pixel):
+
+def extended(shape: Shape, sides: Sequence[int], seen: Seen, pixel: float) -> Shape:
     """A line or an arc, its ends on the given sides moved outwards as far as the images show it; others as they are.
 
     seen: function of a shape and (n,) parameters: how many views see an edge there that is nobody else's.
@@ -20,16 +24,21 @@ def extended(shape, sides, seen, pixel):
     return all_extended([shape], [sides], lambda numbers, places: [seen(*places[0])], pixel)[0]
 
 
-def all_extended(shapes, sides, seen, pixel):
+def all_extended(
+    shapes: Sequence[Shape],
+    sides: Sequence[Sequence[int]],
+    seen: Callable[[list[int], list[Question]], list[np.ndarray]],
+    pixel: float,
+) -> list[Shape]:
     """`extended` for shapes with the sides of each, one step of all of them at a time.
 
     seen: function of the indices of some shapes and [(shape, parameters)] as these are by now.
     """
     found = list(shapes)
     steps = {n: _steps(shape, own, pixel) for n, (shape, own) in enumerate(zip(shapes, sides, strict=True)) if own}
-    answers = dict.fromkeys(steps)
+    answers: dict[int, Any] = dict.fromkeys(steps)
     while steps:
-        questions = {}
+        questions: dict[int, Question] = {}
         for number, generator in list(steps.items()):
             try:
                 questions[number] = generator.send(answers[number])
@@ -41,9 +50,9 @@ def all_extended(shapes, sides, seen, pixel):
     return found
 
 
-def _steps(shape, sides, pixel):
+def _steps(shape: Shape, sides: Sequence[int], pixel: float) -> Generator[Question, Any, Shape]:
     """Generator that asks how many views see places, (shape, parameters), and returns the extended shape."""
-    if shape.kind not in ("line", "arc"):
+    if isinstance(shape, Spline) or shape.kind not in ("line", "arc"):
         return shape
     inside = np.linspace(0.05, 0.95, max(int(shape.length / pixel), 5))
     least = max(GAP_SEEN * np.median((yield shape, inside)), LEAST_GAP_VIEWS)
@@ -60,7 +69,7 @@ def _steps(shape, sides, pixel):
     return shape
 
 
-def shown(ways, good, pixel):
+def shown(ways: np.ndarray, good: np.ndarray, pixel: float) -> float:
     """Length beyond an end that the images show. ways: (n,) from it, a pixel apart. good: (n,) bool, seen there?"""
     last, lost = 0.0, 0.0
     for way, seen_here in zip(ways, good, strict=True):
@@ -71,15 +80,15 @@ def shown(ways, good, pixel):
     return last
 
 
-def turned_round(shape, ahead):
+def turned_round(shape: Line | EllipticArc, ahead: float) -> bool:
     """Would an arc run into itself?"""
-    return shape.kind == "arc" and shape.length + ahead >= 2 * np.pi * shape.radii[0]
+    return isinstance(shape, EllipticArc) and shape.length + ahead >= 2 * np.pi * shape.radii[0]
 
 
-def grown(shape, side, ahead):
+def grown(shape: Line | EllipticArc, side: int, ahead: float) -> Line | EllipticArc:
     """A line or an arc, longer by `ahead` on one side."""
     parameter = side + (2 * side - 1) * ahead / shape.length
-    if shape.kind == "line":
+    if isinstance(shape, Line):
         points = shape.points.copy()
         points[side] = shape.at(parameter)
         return Line(points)

@@ -6,6 +6,7 @@ where their tangents agree. Pairs are joined best first, as long as one point is
 An end that meets no other may lie on another edge between that one's ends: a T-junction, a contact.
 """
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ from taichi_edges.fitting.arcs import through_three
 from taichi_edges.fitting.cubic_chains import lsq_chain, nearest_on_chain
 from taichi_edges.fitting.distances import distances_to
 from taichi_edges.fitting.model_selection import track_of
-from taichi_edges.geometry.shapes import EllipticArc, Line, Spline, bounds_of, near_bounds
+from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline, bounds_of, near_bounds
 from taichi_edges.geometry.wireframe import Edge, Wireframe
 
 REACH_PX = 8.0  # by which an end may move along its edge
@@ -28,6 +29,8 @@ CHAIN_ROUNDS = 3  # in which the places of points on a chain settle
 END_WEIGHT = 1e3  # of the ends of a chain against the points between them
 FAR_ASIDE_PX, FAR_ALONG_PX = 0.3, 3.0  # usual errors of an end, across and along; pairs that ask for less go first
 FRUGAL = 0.05  # weight of the way of an end against the distance that it leaves
+
+Group = dict[int, float]  # ends that meet, indices, and the way of each
 
 
 @dataclass(frozen=True)
@@ -51,18 +54,18 @@ class Meeting:
     cost: float
     first: int
     second: int
-    ways: tuple
+    ways: tuple[float, float]
     smooth: bool
 
 
-def connected(shapes, pixel):
+def connected(shapes: Sequence[Shape], pixel: float) -> Wireframe:
     """The Wireframe of shapes, whose ends meet where they can. pixel: size of a pixel, unit-cube units."""
     open_shapes = [(number, shape) for number, shape in enumerate(shapes) if not shape.closed]
     reaches = [reach_of(number, shape, side, pixel) for number, shape in open_shapes for side in (0, 1)]
     groups = grouped(reaches, meetings(reaches, pixel), pixel)
-    vertices = [meeting_point([(reaches[end], way) for end, way in group.items()]) for group in groups]
+    places = [meeting_point([(reaches[end], way) for end, way in group.items()]) for group in groups]
     at = {(reaches[end].edge, reaches[end].side): number for number, group in enumerate(groups) for end in group}
-    vertices, contacts = with_contacts(shapes, reaches, groups, np.array(vertices).reshape(-1, 3), pixel)
+    vertices, contacts = with_contacts(shapes, reaches, groups, np.array(places).reshape(-1, 3), pixel)
     edges = []
     for number, shape in enumerate(shapes):
         own = () if shape.closed else (at[number, 0], at[number, 1])
@@ -73,7 +76,7 @@ def connected(shapes, pixel):
 # ------------------------------------------------------------------------------------------------------------ ends
 
 
-def reach_of(number, shape, side, pixel):
+def reach_of(number: int, shape: Shape, side: int, pixel: float) -> Reach:
     """The Reach of one end of a shape of some number."""
     inwards = min(REACH_PX * pixel, SHARE * shape.length)
     count = int(round(inwards / (STEP_PX * pixel)))
@@ -82,7 +85,7 @@ def reach_of(number, shape, side, pixel):
     return Reach(number, side, ways, points, tangents)
 
 
-def along_end(shape, side, ways):
+def along_end(shape: Shape, side: int, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points (m, 3) and outward tangents (m, 3) at (m,) ways from an end, positive ones beyond it."""
     sign = 2 * side - 1
     if shape.kind in ("line", "arc"):
@@ -96,7 +99,7 @@ def along_end(shape, side, ways):
     return shape.at(parameters) + np.maximum(ways, 0.0)[:, None] * tangents, tangents
 
 
-def meetings(reaches, pixel):
+def meetings(reaches: Sequence[Reach], pixel: float) -> list[Meeting]:
     """The Meetings of pairs of ends, best first."""
     if len(reaches) < 2:
         return []
@@ -110,7 +113,7 @@ def meetings(reaches, pixel):
     return sorted(found, key=lambda meeting: (meeting.cost, meeting.first, meeting.second))
 
 
-def meet(i, j, first, second, pixel):
+def meet(i: int, j: int, first: Reach, second: Reach, pixel: float) -> Meeting | None:
     """The Meeting of two ends, or None where they come not near enough."""
     apart = np.linalg.norm(first.points[:, None] - second.points, axis=2)
     ways = FRUGAL * (np.abs(first.ways)[:, None] + np.abs(second.ways))
@@ -127,7 +130,7 @@ def meet(i, j, first, second, pixel):
     return Meeting(cost, i, j, (float(first.ways[a]), float(second.ways[b])), smooth)
 
 
-def grouped(reaches, found, pixel):
+def grouped(reaches: Sequence[Reach], found: Iterable[Meeting], pixel: float) -> list[Group]:
     """The ends that meet, as dicts end -> way; every end is in one of them. found: their Meetings."""
     group_of = {end: {end: 0.0} for end in range(len(reaches))}
     for meeting in found:
@@ -145,20 +148,17 @@ def grouped(reaches, found, pixel):
     return list({id(group): group for group in group_of.values()}.values())
 
 
-def agree(reaches, group, pixel):
+def agree(reaches: Sequence[Reach], group: Group, pixel: float) -> bool:
     """Is one point near enough to all the edges that are to meet in it?"""
     point = meeting_point([(reaches[end], way) for end, way in group.items()])
     return all(np.linalg.norm(reaches[end].points - point, axis=1).min() <= MEETING_PX * pixel for end in group)
 
 
-def meeting_point(members):
+def meeting_point(members: Sequence[tuple[Reach, float]]) -> np.ndarray:
     """(3,) the point nearest to the tangents of some ends, each a Reach and a way."""
-    places, tangents = [], []
-    for reach, way in members:
-        at = int(np.argmin(np.abs(reach.ways - way)))
-        places.append(reach.points[at])
-        tangents.append(reach.tangents[at])
-    places, tangents = np.array(places), np.array(tangents)
+    nearest = [int(np.argmin(np.abs(reach.ways - way))) for reach, way in members]
+    places = np.array([reach.points[at] for (reach, _), at in zip(members, nearest, strict=True)])
+    tangents = np.array([reach.tangents[at] for (reach, _), at in zip(members, nearest, strict=True)])
     if len(places) == 1:
         return places[0]
     across = np.eye(3) - tangents[:, :, None] * tangents[:, None, :]
@@ -170,7 +170,9 @@ def meeting_point(members):
 # -------------------------------------------------------------------------------------------------------- contacts
 
 
-def with_contacts(shapes, reaches, groups, vertices, pixel):
+def with_contacts(
+    shapes: Sequence[Shape], reaches: Sequence[Reach], groups: Sequence[Group], vertices: np.ndarray, pixel: float
+) -> tuple[np.ndarray, np.ndarray]:
     """The vertices, those of free ends moved onto an edge that they touch; and (k, 2) the contacts."""
     vertices, contacts, bounds = vertices.copy(), [], bounds_of(shapes)
     for number, group in enumerate(groups):
@@ -194,7 +196,7 @@ def with_contacts(shapes, reaches, groups, vertices, pixel):
     return vertices, np.array(contacts, dtype=np.int64).reshape(-1, 2)
 
 
-def touching(shape, reach, pixel):
+def touching(shape: Shape, reach: Reach, pixel: float) -> tuple[float, np.ndarray] | None:
     """(cost, point) where a free end touches a shape, or None."""
     apart = distances_to(shape, reach.points)
     at = int(np.argmin(apart + FRUGAL * np.abs(reach.ways)))
@@ -203,7 +205,7 @@ def touching(shape, reach, pixel):
     return float(apart[at] + FRUGAL * abs(reach.ways[at])), reach.points[at]
 
 
-def between_ends(shape, point, pixel):
+def between_ends(shape: Shape, point: np.ndarray, pixel: float) -> bool:
     """Does a point on a shape lie clear of its ends? Nearer to them, ends meet, or do not."""
     return shape.closed or np.linalg.norm(shape.ends - point, axis=1).min() > 2 * MEETING_PX * pixel
 
@@ -211,18 +213,16 @@ def between_ends(shape, point, pixel):
 # ------------------------------------------------------------------------------------------------------ new shapes
 
 
-def between(shape, ends, pixel):
+def between(shape: Shape, ends: np.ndarray, pixel: float) -> Shape:
     """A shape of the same kind from one point to another, near its own ends. ends: (2, 3)."""
-    if shape.kind == "line":
+    if isinstance(shape, Line):
         return Line(ends)
-    if shape.kind == "arc":
-        return arc_between(shape, ends)
-    if shape.kind == "elliptic_arc":
-        return ellipse_between(shape, ends)
-    return spline_between(shape, ends, pixel)
+    if isinstance(shape, Spline):
+        return spline_between(shape, ends, pixel)
+    return arc_between(shape, ends) if shape.circular else ellipse_between(shape, ends)
 
 
-def arc_between(shape, ends):
+def arc_between(shape: EllipticArc, ends: np.ndarray) -> Line | EllipticArc:
     """A circular arc from one point to another through the middle of where it was between them."""
     angles = angles_of(shape, ends)
     middle = shape.at((angles.mean() - shape.low) / (shape.high - shape.low))
@@ -230,7 +230,7 @@ def arc_between(shape, ends):
     return Line(ends) if arc is None else arc.shape()
 
 
-def angles_of(shape, ends):
+def angles_of(shape: EllipticArc, ends: np.ndarray) -> np.ndarray:
     """(2,) radians of the places of an EllipticArc nearest to two points by its ends."""
     offsets = ends - shape.centre
     angles = np.arctan2(offsets @ shape.axes[1] / shape.radii[1] ** 2, offsets @ shape.axes[0] / shape.radii[0] ** 2)
@@ -238,7 +238,7 @@ def angles_of(shape, ends):
     return near + (angles - near + np.pi) % (2 * np.pi) - np.pi
 
 
-def ellipse_between(shape, ends):
+def ellipse_between(shape: EllipticArc, ends: np.ndarray) -> EllipticArc:
     """An elliptic arc from one point to another: the ellipse between their angles, sheared to meet them exactly."""
     angles = angles_of(shape, ends)
     middle, half = angles.mean(), 0.5 * (angles[1] - angles[0])
@@ -248,7 +248,7 @@ def ellipse_between(shape, ends):
     return EllipticArc.conjugate(top - first, np.array([first, second]), -half, half)
 
 
-def spline_between(shape, ends, pixel):
+def spline_between(shape: Spline, ends: np.ndarray, pixel: float) -> Spline:
     """An open chain of as many cubics from one point to another, along the chain."""
     track = track_of(shape, pixel)
     heading = np.array([shape.tangents(0.0), shape.tangents(1.0)])
@@ -265,7 +265,7 @@ def spline_between(shape, ends, pixel):
     return Spline(chain_between(points, parameters, count))
 
 
-def chain_between(points, parameters, count):
+def chain_between(points: np.ndarray, parameters: np.ndarray, count: int) -> np.ndarray:
     """A chain of cubics that starts and ends in the first and the last of (n, 3) points and follows the others.
 
     parameters: (n,) where the points are on it, ascending, 0 to count. A heavy weight moves the ends, the rest of the

@@ -8,14 +8,18 @@ what has been imposed counts when the next relation is judged.
 """
 
 from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taichi_edges.evidence.edge_support import SPACING_PX, support_of
+from taichi_edges.evidence.edge_support import SPACING_PX, Support, support_of
 from taichi_edges.fitting.arcs import cross
+from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline
+from taichi_edges.geometry.wireframe import Wireframe
 from taichi_edges.refinement.adjustment import (
     CORRELATED_PX,
     LEAST_NOISE_PX,
@@ -31,6 +35,9 @@ from taichi_edges.refinement.adjustment import (
 )
 from taichi_edges.refinement.charts import STEP, derivatives
 
+if TYPE_CHECKING:
+    from taichi_edges.evidence.edgel_matching import EdgelMatching
+
 KINDS = ("parallel", "perpendicular", "equal_radius", "coaxial", "coplanar")
 MOST_TURN = np.radians(2.0)  # what is farther from parallel or perpendicular is no candidate; by chance 1 pair in 30 is
 MOST_OFF_PX, MOST_RATIO = 3.0, 0.05  # distances and radii, likewise
@@ -42,10 +49,11 @@ CHECKS = 4  # adjustments after which relations that the images contradict have 
 DIRECTION, PLACE, RADIUS = slice(0, 3), slice(3, 6), 6
 
 
-def features(shape):
+def features(shape: Shape) -> np.ndarray:
     """(7,) what relations are about: direction of a line or normal of a plane, middle or centre, radius (0: none)."""
-    if shape.kind == "line":
+    if isinstance(shape, Line):
         return np.concatenate([shape.tangents(0.5), shape.at(0.5), [0.0]])
+    assert isinstance(shape, EllipticArc)  # a spline has no relations
     radius = shape.radii.mean() if shape.circular else 0.0
     normal = cross(*shape.axes)
     return np.concatenate([normal / np.sqrt(normal @ normal), shape.centre, [radius]])
@@ -56,15 +64,15 @@ class Relation:
     """kind: one of KINDS. edges: indices, each once. values: function of their features -> (m,), 0 where it holds."""
 
     kind: str
-    edges: tuple
-    values: object
+    edges: tuple[int, ...]
+    values: Callable[..., np.ndarray]
 
-    def constraint(self):
+    def constraint(self) -> Constraint:
         """The Constraint that makes it hold."""
         return Constraint(self.edges, self.values, DEVIATION, hard=True, about=features)
 
 
-def regularised(wireframe, matching):
+def regularised(wireframe: Wireframe, matching: "EdgelMatching") -> tuple[Wireframe, dict[str, tuple[int, int]]]:
     """An adjusted Wireframe with the relations that its edges have as far as the images can tell.
 
     matching: EdgelMatching. Returns the Wireframe, and {kind: (number found, number of these that were imposed)}; the
@@ -90,9 +98,10 @@ def regularised(wireframe, matching):
     return regular, {kind: (found[kind] - lost[kind], kept[kind]) for kind in KINDS}
 
 
-def found_relations(wireframe, matching):
+def found_relations(wireframe: Wireframe, matching: "EdgelMatching") -> tuple[Counter[str], list[Relation]]:
     """Counter of the relations found by kind, and the list of those that the others do not imply."""
-    counts, imposed = Counter(), []
+    counts: Counter[str] = Counter()
+    imposed = []
     judge = Judge.of(wireframe, matching)
     for kind in KINDS:
         candidates = [(relation, judge.linear(relation)) for relation in CANDIDATES[kind](wireframe, matching.pixel)]
@@ -135,7 +144,7 @@ class Judge:
     """
 
     @staticmethod
-    def of(wireframe, matching):
+    def of(wireframe: Wireframe, matching: "EdgelMatching") -> "Judge":
         """From the equations of an adjusted Wireframe."""
         layout = Layout.of(wireframe)
         problem = Problem(wireframe, layout, matching.pixel)
@@ -150,21 +159,22 @@ class Judge:
         observations = (support.edgels >= 0).sum() * SPACING_PX / CORRELATED_PX
         return Judge(wireframe, layout, covariance, np.log(max(observations, 2.0)))
 
-    def __init__(self, wireframe, layout, covariance, allowed):
+    def __init__(self, wireframe: Wireframe, layout: Layout, covariance: np.ndarray, allowed: float) -> None:
         self.columns, self.covariance, self.allowed = layout.columns, covariance, allowed
         self.shift = np.zeros(layout.size)
-        self.features, self.slopes = {}, {}
+        self.features: dict[int, np.ndarray] = {}
+        self.slopes: dict[int, np.ndarray] = {}
         for number, shape in enumerate(wireframe.shapes):
-            if shape.kind != "spline":
+            if not isinstance(shape, Spline):
                 self.features[number] = features(shape)
                 self.slopes[number] = derivatives(neighbors_of(wireframe, number), features)
 
-    def linear(self, relation):
+    def linear(self, relation: Relation) -> Linear:
         """A relation as a Linear one, at the wireframe as it was given."""
         given = np.concatenate([self.features[number] for number in relation.edges])
         pieces = len(relation.edges)
 
-        def values(step):
+        def values(step: np.ndarray | float) -> np.ndarray:
             return relation.values(*(given + step).reshape(pieces, -1))
 
         by_features = np.stack([(values(s) - values(-s)) / (2 * STEP) for s in STEP * np.eye(len(given))], axis=1)
@@ -176,7 +186,7 @@ class Judge:
         np.add.at(summed.T, np.searchsorted(each, unknowns), slopes.T)
         return Linear(values(0.0), summed, each)
 
-    def rise(self, linear):
+    def rise(self, linear: Linear) -> float:
         """Rise of the sum of squares for each unknown that a relation takes away; 0 where it is implied."""
         found = self._axes(linear)
         off, free = found.off, found.free
@@ -184,7 +194,7 @@ class Judge:
             return np.inf
         return float((off[free] ** 2 / found.variances[free]).sum() / max(free.sum(), 1))
 
-    def impose(self, linear):
+    def impose(self, linear: Linear) -> bool:
         """Take a relation for granted. Returns whether it was not implied already."""
         found = self._axes(linear)
         free, axes = found.free, found.axes[:, found.free]
@@ -193,7 +203,7 @@ class Judge:
         self.covariance -= gain @ (found.reach @ axes).T
         return bool(free.any())
 
-    def _axes(self, linear):
+    def _axes(self, linear: Linear) -> PrincipalAxes:
         """The PrincipalAxes of a Linear relation, by what is known so far."""
         reach = self.covariance[:, linear.unknowns] @ linear.slopes.T
         variances, axes = np.linalg.eigh(linear.slopes @ reach[linear.unknowns])
@@ -201,7 +211,7 @@ class Judge:
         return PrincipalAxes(off, variances, variances > IMPLIED**2, axes, reach)
 
 
-def _risen(before, after, relations):
+def _risen(before: Support, after: Support, relations: Sequence[Relation]) -> set[int]:
     """Set of the edges whose own residuals have risen by more than their relations are worth."""
     noise = max(before.noise_px, LEAST_NOISE_PX)
     observations = before.samples.sums((before.edgels >= 0).sum(axis=1)) * SPACING_PX / CORRELATED_PX
@@ -211,7 +221,7 @@ def _risen(before, after, relations):
     return {number for number in related if rise[number] > allowed * max(related[number], 1)}
 
 
-def _of_kind(wireframe, *kinds):
+def _of_kind(wireframe: Wireframe, *kinds: str) -> list[tuple[int, np.ndarray]]:
     """[(index, features)] of the edges of some kinds."""
     return [(number, features(shape)) for number, shape in enumerate(wireframe.shapes) if shape.kind in kinds]
 
@@ -219,28 +229,28 @@ def _of_kind(wireframe, *kinds):
 LINES, ROUND, FLAT = ("line",), ("arc", "circle"), ("arc", "circle", "elliptic_arc", "ellipse")
 
 
-def _parallel(wireframe, pixel):
+def _parallel(wireframe: Wireframe, pixel: float) -> Iterator[Relation]:
     """Directions of lines, and normals of arcs."""
     for (one, a), (other, b) in combinations(_of_kind(wireframe, *LINES, *FLAT), 2):
         if np.linalg.norm(cross(a[DIRECTION], b[DIRECTION])) < np.sin(MOST_TURN):
             yield Relation("parallel", (one, other), partial(_cross, _sides(a[DIRECTION])))
 
 
-def _perpendicular(wireframe, pixel):
+def _perpendicular(wireframe: Wireframe, pixel: float) -> Iterator[Relation]:
     """Likewise."""
     for (one, a), (other, b) in combinations(_of_kind(wireframe, *LINES, *FLAT), 2):
         if abs(a[DIRECTION] @ b[DIRECTION]) < np.sin(MOST_TURN):
             yield Relation("perpendicular", (one, other), _cosine)
 
 
-def _equal_radius(wireframe, pixel):
+def _equal_radius(wireframe: Wireframe, pixel: float) -> Iterator[Relation]:
     """Arcs and circles."""
     for (one, a), (other, b) in combinations(_of_kind(wireframe, *ROUND), 2):
         if abs(a[RADIUS] - b[RADIUS]) < min(MOST_OFF_PX * pixel, MOST_RATIO * a[RADIUS]):
             yield Relation("equal_radius", (one, other), _radii)
 
 
-def _coaxial(wireframe, pixel):
+def _coaxial(wireframe: Wireframe, pixel: float) -> Iterator[Relation]:
     """Arcs and circles: the centre of one on the axis of the other."""
     for (one, a), (other, b) in combinations(_of_kind(wireframe, *ROUND), 2):
         axis = a[DIRECTION]
@@ -249,9 +259,9 @@ def _coaxial(wireframe, pixel):
                 yield Relation("coaxial", (one, other), partial(_off_axis, _sides(axis)))
 
 
-def _coplanar(wireframe, pixel):
+def _coplanar(wireframe: Wireframe, pixel: float) -> Iterator[Relation]:
     """Lines and arcs in the plane of an arc, or in that of two lines that share a vertex."""
-    planes = []
+    planes: list[tuple[np.ndarray, np.ndarray]] = []
     edges = dict(_of_kind(wireframe, *LINES, *FLAT))
     for members in _plane_spans(wireframe, edges):
         normal, place = _plane(*(edges[number] for number in members))
@@ -265,7 +275,7 @@ def _coplanar(wireframe, pixel):
                 yield Relation("coplanar", (*members, number), partial(_off_plane, sides if flat else None))
 
 
-def _plane_spans(wireframe, edges):
+def _plane_spans(wireframe: Wireframe, edges: dict[int, np.ndarray]) -> Iterator[tuple[int, ...]]:
     """Tuples of edges that span a plane: arcs and circles, then pairs of lines that share a vertex."""
     yield from ((number,) for number in edges if wireframe.shapes[number].kind != "line")
     for one, other in combinations([number for number in edges if wireframe.shapes[number].kind == "line"], 2):
@@ -274,7 +284,7 @@ def _plane_spans(wireframe, edges):
                 yield one, other
 
 
-def _plane(*span):
+def _plane(*span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit normal and a place of the plane of an arc, or of two lines."""
     if len(span) == 1:
         return span[0][DIRECTION], span[0][PLACE]
@@ -282,40 +292,40 @@ def _plane(*span):
     return normal / np.linalg.norm(normal), span[0][PLACE]
 
 
-def _in_plane(normal, place, other, where, pixel):
+def _in_plane(normal: np.ndarray, place: np.ndarray, other: np.ndarray, where: np.ndarray, pixel: float) -> bool:
     """Whether two planes are one, as far as candidates go."""
     turned = np.linalg.norm(cross(normal, other)) < np.sin(MOST_TURN)
     return turned and abs((place - where) @ other) < MOST_OFF_PX * pixel
 
 
-def _lies_in(normal, place, feature, flat, pixel):
+def _lies_in(normal: np.ndarray, place: np.ndarray, feature: np.ndarray, flat: bool, pixel: float) -> bool:
     """Whether an edge is in a plane, as far as candidates go."""
     turn = np.linalg.norm(cross(normal, feature[DIRECTION])) if flat else abs(normal @ feature[DIRECTION])
     return turn < np.sin(MOST_TURN) and abs(normal @ (feature[PLACE] - place)) < MOST_OFF_PX * pixel
 
 
-def _sides(direction):
+def _sides(direction: np.ndarray) -> np.ndarray:
     """(2, 3) unit vectors across a direction."""
     return np.linalg.svd(direction[None])[2][1:]
 
 
-def _cross(sides, a, b):
+def _cross(sides: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return sides @ cross(a[DIRECTION], b[DIRECTION])
 
 
-def _cosine(a, b):
+def _cosine(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.array([a[DIRECTION] @ b[DIRECTION]])
 
 
-def _radii(a, b):
+def _radii(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.array([a[RADIUS] - b[RADIUS]])
 
 
-def _off_axis(sides, a, b):
+def _off_axis(sides: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return sides @ cross(a[DIRECTION], b[PLACE] - a[PLACE])
 
 
-def _off_plane(sides, *span):
+def _off_plane(sides: np.ndarray | None, *span: np.ndarray) -> np.ndarray:
     """The last of the features against the plane of the others. sides: across its normal, None for a line."""
     normal, place = _plane(*span[:-1])
     last = span[-1]

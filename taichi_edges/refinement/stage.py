@@ -1,11 +1,14 @@
 """From single edges to a wireframe: connected, minimal, in agreement with the images."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from taichi_edges.evidence.edge_support import (
+    Support,
     claims_of,
     evidence_of,
     steadiness_of_edges,
@@ -16,6 +19,8 @@ from taichi_edges.evidence.edge_support import (
 )
 from taichi_edges.evidence.edgel_matching import EdgelMatching
 from taichi_edges.fitting.model_selection import Yardstick
+from taichi_edges.geometry.shapes import Shape
+from taichi_edges.geometry.wireframe import Wireframe
 from taichi_edges.refinement.adjustment import adjusted
 from taichi_edges.refinement.anchoring import anchored_lines
 from taichi_edges.refinement.completion import completed
@@ -23,6 +28,10 @@ from taichi_edges.refinement.continuation import continued
 from taichi_edges.refinement.extents import all_extended
 from taichi_edges.refinement.junctions import connected
 from taichi_edges.refinement.regularities import found_relations, regularised
+
+if TYPE_CHECKING:
+    from taichi_edges.scene.settings import RefineConfig
+    from taichi_edges.views.views import Views
 
 NOISE_PX = 0.2  # by which an edge is off its shape, beyond the noise: next to other edges every detector is biased
 LEAST_LENGTH_PX = 0.1  # of a stroke; a shorter one has no direction
@@ -49,10 +58,10 @@ class RefineCounts:
     anchored: int = 0
     lines: int = 0
     unsupported: int = 0
-    relations: dict = field(default_factory=dict)
+    relations: dict[str, tuple[int, int]] = field(default_factory=dict)
 
 
-def refine_wireframe(loose, views, config):
+def refine_wireframe(loose: Wireframe, views: "Views", config: "RefineConfig") -> tuple[Wireframe, RefineCounts]:
     """The Wireframe of `loose` edges, in the unit cube, and RefineCounts.
 
     views: Views. config: the scene's `refine` section. ti.init must have been called.
@@ -71,7 +80,9 @@ def refine_wireframe(loose, views, config):
     return judged, counts
 
 
-def whole_edges(shapes, matching, config):
+def whole_edges(
+    shapes: Sequence[Shape], matching: EdgelMatching, config: "RefineConfig"
+) -> tuple[list[Shape], RefineCounts]:
     """The shapes of whole edges from those of strokes, and RefineCounts of what that took.
 
     Free ends are extended only when it is known which are free, and then some more strokes continue each other.
@@ -85,13 +96,15 @@ def whole_edges(shapes, matching, config):
     return found, RefineCounts(**asdict(first + second), unsupported=unsupported)
 
 
-def yardstick_of(shapes, matching):
+def yardstick_of(shapes: Sequence[Shape], matching: EdgelMatching) -> Yardstick:
     """The Yardstick of strokes: the noise of their edgels, and by how much edges are off beyond it."""
     noise = np.hypot(NOISE_PX, support_of(matching, shapes).noise_px)
     return Yardstick(noise * matching.pixel, matching.pixel)
 
 
-def related(wireframe, matching, impose):
+def related(
+    wireframe: Wireframe, matching: EdgelMatching, impose: bool
+) -> tuple[Wireframe, dict[str, tuple[int, int]]]:
     """The Wireframe, with the relations that its edges have if these are to be imposed; and RefineCounts.relations."""
     if impose:
         return regularised(wireframe, matching)
@@ -100,7 +113,7 @@ def related(wireframe, matching, impose):
     return wireframe, {kind: (count, 0) for kind, count in found_relations(wireframe, matching)[0].items()}
 
 
-def with_evidence(wireframe, matching, config):
+def with_evidence(wireframe: Wireframe, matching: EdgelMatching, config: "RefineConfig") -> Wireframe:
     """The Wireframe with what the images say about each edge, and without those they do not support."""
     support = support_of(matching, wireframe.shapes)
     found = evidence_of(support)
@@ -109,13 +122,15 @@ def with_evidence(wireframe, matching, config):
     return replace(wireframe, edges=edges).keep(sure & is_edge(matching, support, wireframe.shapes, config))
 
 
-def with_support(matching, shapes, config):
+def with_support(matching: EdgelMatching, shapes: Sequence[Shape], config: "RefineConfig") -> list[Shape]:
     """The shapes that the images support; their places are not exact yet."""
     kept = is_edge(matching, support_of(matching, shapes), shapes, config, LENIENT)
     return [shape for shape, keep in zip(shapes, kept, strict=True) if keep]
 
 
-def is_edge(matching, support, shapes, config, lenience=1.0):
+def is_edge(
+    matching: EdgelMatching, support: Support, shapes: Sequence[Shape], config: "RefineConfig", lenience: float = 1.0
+) -> np.ndarray:
     """(E,) bool: enough of a shape is supported, by enough views, and its edgels stay on it as the viewpoint moves.
 
     config: the scene's `refine` section. lenience: factor on what it asks for.
@@ -126,13 +141,13 @@ def is_edge(matching, support, shapes, config, lenience=1.0):
     return enough & (steadiness_of_edges(matching, support) >= lenience * config.min_steadiness)
 
 
-def with_longer_ends(matching, shapes):
+def with_longer_ends(matching: EdgelMatching, shapes: Sequence[Shape]) -> list[Shape]:
     """The shapes, ends that would meet no other extended as far as the images show them."""
     wireframe, claims = connected(shapes, matching.pixel), claims_of(matching, shapes)
     degrees = wireframe.degrees
     free = [[side for side, end in enumerate(edge.vertices) if degrees[end] == 1] for edge in wireframe.edges]
 
-    def seen(numbers, places):
+    def seen(numbers: list[int], places: list[tuple[Shape, np.ndarray]]) -> list[np.ndarray]:
         return support_of_places(matching, places, claims, numbers)
 
     return all_extended(shapes, free, seen, matching.pixel)

@@ -1,6 +1,7 @@
 """Straight runs of edgels in the views: bent chains are cut, and what one straight line continues is joined."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -8,6 +9,9 @@ from scipy.spatial import cKDTree
 from taichi_edges.arrays.columns import Columns
 from taichi_edges.arrays.components import components
 from taichi_edges.detectors.chains import links_between
+
+if TYPE_CHECKING:
+    from taichi_edges.views.edgels import Edgels
 
 LINKED_PX, LINKED_BESIDE_PX = 1.6, 0.8  # edgels of one 2D edge: apart, to the side
 LINKED_COSINE = np.sqrt(1 - 0.25**2)  # between their normals, 14 degrees
@@ -27,17 +31,17 @@ class Runs(Columns):
     ends: np.ndarray
 
     @property
-    def lengths(self):
+    def lengths(self) -> np.ndarray:
         """(n,) px."""
         return np.linalg.norm(self.ends[:, 1] - self.ends[:, 0], axis=1)
 
     @property
-    def along(self):
+    def along(self) -> np.ndarray:
         """(n, 2) unit vectors."""
         return (self.ends[:, 1] - self.ends[:, 0]) / np.maximum(self.lengths, 1e-300)[:, None]
 
 
-def runs_of(edgels, free):
+def runs_of(edgels: "Edgels", free: np.ndarray) -> Runs:
     """The Runs of those Edgels that are free, (e,) bool."""
     views, ends = [np.zeros(0, np.int64)], [np.zeros((0, 2, 2))]
     for view in range(edgels.view_count):
@@ -49,7 +53,7 @@ def runs_of(edgels, free):
     return Runs(np.concatenate(views), np.concatenate(ends))
 
 
-def straight_runs(points, normals):
+def straight_runs(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(n, 2, 2) ends, px, of the straight runs among the edgels of one view. points, normals: (m, 2)."""
     labels = chains(points, normals)
     points, labels = straightened(points, labels)
@@ -61,7 +65,7 @@ def straight_runs(points, normals):
     return ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) >= LEAST_LENGTH_PX]
 
 
-def chains(points, normals):
+def chains(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(m,) labels of edgels, the same for those that follow each other on a smooth 2D edge."""
     if not len(points):
         return np.zeros(0, np.int64)
@@ -70,7 +74,7 @@ def chains(points, normals):
     return components(len(points), first[linked], second[linked])
 
 
-def straightened(points, labels):
+def straightened(points: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The points of straight runs and their labels, 0 .. n - 1: bent runs are cut where they are farthest off."""
     done_points, done_labels, count = [np.zeros((0, 2))], [np.zeros(0, np.int64)], 0
     for _ in range(SPLITS):
@@ -90,7 +94,9 @@ def straightened(points, labels):
     return np.concatenate(done_points), np.concatenate(done_labels)
 
 
-def halved(points, labels, means, axes):
+def halved(
+    points: np.ndarray, labels: np.ndarray, means: np.ndarray, axes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """(n,) bool, whether a run bends; and (m,) labels of its halves, cut where it is farthest from its chord."""
     way = ((points - means[labels]) * axes[labels]).sum(axis=1)
     first, last = (farthest(sign * way, labels) for sign in (-1.0, 1.0))
@@ -105,33 +111,33 @@ def halved(points, labels, means, axes):
     return bent, 2 * labels + (way > cut[labels])
 
 
-def off_lines(points, starts, along):
+def off_lines(points: np.ndarray, starts: np.ndarray, along: np.ndarray) -> np.ndarray:
     """(n,) distances of points (n, 2) from lines through (n, 2) points along (n, 2) unit vectors."""
     offsets = points - starts
     return np.abs(offsets[:, 0] * along[:, 1] - offsets[:, 1] * along[:, 0])
 
 
-def farthest(values, labels):
+def farthest(values: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """(n,) index of the greatest of the values (m,) with each label."""
     order = np.lexsort((values, labels))
     return order[np.flatnonzero(np.diff(labels[order], append=-1))]
 
 
-def extremes(values, labels, function):
+def extremes(values: np.ndarray, labels: np.ndarray, function: np.ufunc) -> np.ndarray:
     """(n,) np.minimum or np.maximum of the values (m,) with each label."""
     found = np.full(labels.max(initial=-1) + 1, np.inf if function is np.minimum else -np.inf)
     function.at(found, labels, values)
     return found
 
 
-def moments_of(points, labels):
+def moments_of(points: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """(n, 6) count, sums of x, y, xx, xy, yy of the points with each label; those of a union are the sum."""
     x, y = points.T
     columns = (np.ones(len(points)), x, y, x * x, x * y, y * y)
     return np.column_stack([np.bincount(labels, column) for column in columns])
 
 
-def axes_of(moments):
+def axes_of(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(n, 2) means and (n, 2) unit vectors along the points with such moments."""
     means = moments[:, 1:3] / moments[:, :1]
     xx = moments[:, 3] / moments[:, 0] - means[:, 0] ** 2
@@ -141,14 +147,14 @@ def axes_of(moments):
     return means, np.column_stack([np.cos(angles), np.sin(angles)])
 
 
-def ends_of(points, labels, means, axes):
+def ends_of(points: np.ndarray, labels: np.ndarray, means: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """(n, 2, 2) ends of the runs: their outermost points, on the line through all."""
     way = ((points - means[labels]) * axes[labels]).sum(axis=1)
     low, high = extremes(way, labels, np.minimum), extremes(way, labels, np.maximum)
     return means[:, None] + np.stack([low, high], axis=1)[:, :, None] * axes[:, None]
 
 
-def bridged(ends, moments):
+def bridged(ends: np.ndarray, moments: np.ndarray) -> np.ndarray:
     """The ends of runs, those that continue each other on one straight line joined. moments: (n, 6) of their points."""
     for _ in range(BRIDGINGS):
         first, second = continuing(ends)
@@ -162,7 +168,7 @@ def bridged(ends, moments):
     return ends
 
 
-def continuing(ends):
+def continuing(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of runs that continue each other, first and second (k,): each the other's best."""
     places, outer = ends.reshape(-1, 2), ends[:, ::-1].reshape(-1, 2)
     a, b = cKDTree(places).query_pairs(BRIDGED_PX, output_type="ndarray").T

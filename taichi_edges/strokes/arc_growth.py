@@ -1,6 +1,7 @@
 """Lines and circular arcs grown over oriented points, as far as places and directions agree."""
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.spatial import cKDTree
 from taichi_edges.arrays.columns import Columns
 from taichi_edges.arrays.ranges import ragged
 from taichi_edges.fitting.arc_batch import ArcBatch, fit_batch
+from taichi_edges.fitting.arcs import Arc
 
 INLIER = 3.0  # noises: a point on an edge lies no farther from it (99 % of those of a normal distribution in a plane)
 SAGITTA = 3.0  # noises that the middle of an arc is off its chord, at least; a line follows a flatter one as well
@@ -35,49 +37,54 @@ class Scale:
     spread: float = 1.0
 
     @property
-    def lever(self):
+    def lever(self) -> float:
         """Noise of the points over that of the directions: on a stretch as short as that, directions tell more."""
         return min(self.noise / self.turn, self.gap)
 
     @property
-    def cosine(self):
+    def cosine(self) -> float:
         """A point whose direction is off by more is on another edge."""
         return float(np.cos(np.clip(self.spread * max(DIRECTION_NOISES * self.turn, TURNS[0]), *TURNS)))
 
 
 @dataclass(frozen=True)
 class Inliers(Columns):
-    """Points on a line or an arc, or on several.
+    """Points on a line or an arc.
 
-    members: (n,) indices of the points. along: (n,) their arc lengths. squared: (n,) squared residuals, noises. of:
-    (n,) number of the arc, ascending; None where there is but one.
+    members: (n,) indices of the points. along: (n,) their arc lengths. squared: (n,) squared residuals, noises.
     """
 
     members: np.ndarray
     along: np.ndarray
     squared: np.ndarray
-    of: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class InliersOfArcs(Inliers):
+    """Points on several lines or arcs. of: (n,) number of the arc, ascending."""
+
+    of: np.ndarray
 
 
 class Cloud:
     """Oriented points in a search tree: points, directions (n, 3), scale: Scale."""
 
-    def __init__(self, points, directions, scale, tree=None):
+    def __init__(self, points: np.ndarray, directions: np.ndarray, scale: Scale, tree: cKDTree | None = None) -> None:
         self.points, self.directions, self.scale = points, directions, scale
         self.tree = cKDTree(points) if tree is None else tree
         self.noises = np.full(len(points), scale.noise)
 
-    def at_scale(self, scale):
+    def at_scale(self, scale: Scale) -> "Cloud":
         """The same points with another Scale."""
         return Cloud(self.points, self.directions, scale, self.tree)
 
-    def with_noises(self, noises):
+    def with_noises(self, noises: np.ndarray) -> "Cloud":
         """The same points, each with a noise of its own: (n,), unit-cube units."""
         cloud = self.at_scale(self.scale)
         cloud.noises = noises
         return cloud
 
-    def near(self, arc, low, high, tolerance=INLIER):
+    def near(self, arc: Arc, low: float, high: float, tolerance: float = INLIER) -> np.ndarray:
         """Indices of the points about the arc between two arc lengths; some farther ones are among them."""
         high = min(high, low + arc.round)
         count = int((high - low) / (BALL * self.scale.noise)) + 1
@@ -86,7 +93,7 @@ class Cloud:
         found = self.tree.query_ball_point(arc.at(low + step * (np.arange(count) + 0.5)), radius)
         return np.unique(np.fromiter(itertools.chain.from_iterable(found), np.int64))
 
-    def inliers(self, arc, low, high, tolerance=INLIER):
+    def inliers(self, arc: Arc, low: float, high: float, tolerance: float = INLIER) -> Inliers:
         """The Inliers of an Arc between two arc lengths.
 
         tolerance: noises that they may be off.
@@ -98,18 +105,18 @@ class Cloud:
         good = (squared <= tolerance**2) & agree & (along >= low) & (along <= high)
         return Inliers(around[good], along[good], squared[good])
 
-    def inliers_of(self, arcs, low, high):
+    def inliers_of(self, arcs: ArcBatch, low: np.ndarray, high: np.ndarray) -> InliersOfArcs:
         """The Inliers of the arcs of an ArcBatch, arc after arc, each between two arc lengths, (m,)."""
         of, around = self._near_each(arcs, low, high)
         stretched = ArcBatch(arcs.origin, arcs.tangent, arcs.bend, low, high, arcs.closed)
         along, offsets = stretched.coordinates(self.points[around], of)
         squared = (offsets**2).sum(axis=1) / self.scale.noise**2
         good = (squared <= INLIER**2) & (along >= low[of]) & (along <= high[of])
-        on = Inliers(around, along, squared, of).keep(good)
+        on = InliersOfArcs(around, along, squared, of).keep(good)
         agree = np.abs((self.directions[on.members] * arcs.tangents(on.along, on.of)).sum(axis=1)) >= self.scale.cosine
         return on.keep(agree)
 
-    def _near_each(self, arcs, low, high):
+    def _near_each(self, arcs: ArcBatch, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Numbers of the arcs, and indices of the points about them, (t,); some farther ones are among them."""
         high = np.minimum(high, low + arcs.round)
         counts = ((high - low) / (BALL * self.scale.noise)).astype(int) + 1
@@ -123,7 +130,7 @@ class Cloud:
         return keys // len(self.points), keys % len(self.points)
 
 
-def grow_arcs(cloud, arcs, straight):
+def grow_arcs(cloud: Cloud, arcs: ArcBatch, straight: bool) -> tuple[ArcBatch, np.ndarray]:
     """The longest unbroken lines or arcs that those of an ArcBatch are parts of; (m,) bool, whether there are any."""
     scale, best, found, active = cloud.scale, arcs, np.zeros(len(arcs), bool), np.arange(len(arcs))
     for _ in range(GROWTH_ROUNDS if len(arcs) else 0):
@@ -147,7 +154,7 @@ def grow_arcs(cloud, arcs, straight):
     return best, found
 
 
-def all_unbroken(of, along, low, high, gap):
+def all_unbroken(of: np.ndarray, along: np.ndarray, low: np.ndarray, high: np.ndarray, gap: np.ndarray) -> np.ndarray:
     """(t,) bool: the points reached from their arc's stretch low..high without a step longer than its gap, (m,) each.
 
     of, along: (t,) number of the arc, and arc length on it.
@@ -168,7 +175,7 @@ def all_unbroken(of, along, low, high, gap):
     return inside
 
 
-def unbroken(along, low, high, gap):
+def unbroken(along: np.ndarray, low: float, high: float, gap: float) -> np.ndarray:
     """(n,) bool: the points reached from the stretch low..high without a step longer than `gap`."""
     order = np.argsort(along, kind="stable")
     sorted_along = along[order]
@@ -181,13 +188,16 @@ def unbroken(along, low, high, gap):
     return inside
 
 
-def grown_from_seeds(cloud, neighbors, seeds):
+def grown_from_seeds(
+    cloud: Cloud, neighbors: Sequence[np.ndarray], seeds: np.ndarray
+) -> list[tuple[Arc | None, Arc | None]]:
     """For each of (m,) seeds the line and the arc grown from it, a list of pairs; None where there is none.
 
     neighbors: for every point its aligned neighbours, an index array. Where there is a line the arc starts from what
     that goes along, which on an arc is a chord.
     """
-    lines, arcs = [None] * len(seeds), [None] * len(seeds)
+    lines: list[Arc | None] = [None] * len(seeds)
+    arcs: list[Arc | None] = [None] * len(seeds)
     rich = np.flatnonzero([len(neighbors[seed]) >= START_POINTS - 1 for seed in seeds])
     starts, of, members = from_neighbors(cloud, neighbors, seeds[rich])
     grown, found = refitted(cloud, starts, of, members, straight=True)
@@ -204,7 +214,9 @@ def grown_from_seeds(cloud, neighbors, seeds):
     return list(zip(lines, arcs, strict=True))
 
 
-def from_neighbors(cloud, neighbors, seeds):
+def from_neighbors(
+    cloud: Cloud, neighbors: Sequence[np.ndarray], seeds: np.ndarray
+) -> tuple[ArcBatch, np.ndarray, np.ndarray]:
     """An ArcBatch of lines through seeds, (m,); and their aligned neighbours and themselves: numbers, indices (t,)."""
     near = [np.append(neighbors[seed], seed) for seed in seeds]
     of = np.repeat(np.arange(len(seeds)), [len(some) for some in near])
@@ -216,7 +228,9 @@ def from_neighbors(cloud, neighbors, seeds):
     return starts, of, members
 
 
-def refitted(cloud, starts, of, members, straight):
+def refitted(
+    cloud: Cloud, starts: ArcBatch, of: np.ndarray, members: np.ndarray, straight: bool
+) -> tuple[ArcBatch, np.ndarray]:
     """An ArcBatch fitted to some points of each and grown from there; (m,) bool, whether there is a line, or an arc.
 
     of, members: (t,) number of the arc, and index of the point. What bends too little is no arc.
@@ -229,6 +243,6 @@ def refitted(cloud, starts, of, members, straight):
     return arcs, found & (straight | (arcs.sagitta >= SAGITTA * scale.noise))
 
 
-def sagitta(arc):
+def sagitta(arc: Arc) -> float:
     """How far the middle of an arc is off its chord; of more than half a circle, the radius at least."""
     return (1 - np.cos(min(0.5 * arc.curvature * arc.length, np.pi))) / max(arc.curvature, 1e-9)

@@ -1,8 +1,12 @@
 """From oriented points to the points of every edge: graph traversal, whole lines and arcs, what is left, merging."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
+from taichi_edges.fitting.arcs import Arc
 from taichi_edges.geometry.shapes import Line
+from taichi_edges.geometry.wireframe import Wireframe
 from taichi_edges.strokes.arc_growth import Cloud
 from taichi_edges.strokes.branches import separate_branches
 from taichi_edges.strokes.claiming import claims
@@ -11,15 +15,18 @@ from taichi_edges.strokes.clustering import grow_clusters, seed_order
 from taichi_edges.strokes.clusters import Clusters
 from taichi_edges.strokes.free_curves import free_curves
 from taichi_edges.strokes.merging import merged
-from taichi_edges.strokes.neighbors import UNASSIGNED, alignment, members_of_clusters, neighbor_graph
+from taichi_edges.strokes.neighbors import UNASSIGNED, NeighborGraph, alignment, members_of_clusters, neighbor_graph
 from taichi_edges.strokes.noise import MOST_NOISE, measured_scale
 from taichi_edges.strokes.segmentation import split_clusters
+
+if TYPE_CHECKING:
+    from taichi_edges.scene.settings import ClusterConfig, FitConfig
 
 HALO = 0.5  # of a point's neighbours: where so many lie on an edge, the point is a stray one of it
 MOST_NOISE_PX = 3.0  # an edgel so far off would not have been the edge's
 
 
-def assemble(points, directions, config, pixel=np.inf):
+def assemble(points: np.ndarray, directions: np.ndarray, config: "ClusterConfig", pixel: float = np.inf) -> Clusters:
     """The Clusters of oriented points.
 
     points: (n, 3) unit cube. directions: (n, 3) unit vectors, sign arbitrary. config: the scene's `cluster` section.
@@ -50,14 +57,14 @@ def assemble(points, directions, config, pixel=np.inf):
     return without_empty(Clusters(points, directions, labels, np.concatenate(shared), arcs))
 
 
-def without_empty(clusters):
+def without_empty(clusters: Clusters) -> Clusters:
     """The Clusters without edges that have lost all of their points to a free curve."""
     used = np.zeros(len(clusters.arcs), bool)
     used[clusters.labels[clusters.labels >= 0]] = True
     return clusters.keep(used)
 
 
-def left_over(cloud, graph, owner, config):
+def left_over(cloud: Cloud, graph: NeighborGraph, owner: np.ndarray, config: "ClusterConfig") -> np.ndarray:
     """(n,) labels of the clusters that graph traversal finds in what no line or arc has claimed.
 
     What has mostly claimed points around it is their halo, and no edge of its own. graph: NeighborGraph of the points.
@@ -73,7 +80,7 @@ def left_over(cloud, graph, owner, config):
     return labels
 
 
-def fit_clusters(clusters, config):
+def fit_clusters(clusters: Clusters, config: "FitConfig") -> tuple[Wireframe, dict[str, int]]:
     """The loose Wireframe of Clusters, and the dict kind -> number of edges. config: the scene's `fit` section."""
     own = members_of_clusters(clusters.labels)
     also = sharers(clusters.shared, len(clusters.arcs))
@@ -82,14 +89,14 @@ def fit_clusters(clusters, config):
     return wireframe_of(fit_edge(clusters.points[some], arc, config) for some, arc in pairs)
 
 
-def sharers(shared, count):
+def sharers(shared: np.ndarray, count: int) -> list[np.ndarray]:
     """The points of each of `count` edges that they share with others: a list of index arrays."""
     order = np.argsort(shared[:, 1], kind="stable")
     bounds = np.searchsorted(shared[order, 1], np.arange(count + 1))
     return [shared[order[start:end], 0] for start, end in zip(bounds[:-1], bounds[1:], strict=True)]
 
 
-def fit_edge(points, arc, config):
+def fit_edge(points: np.ndarray, arc: Arc | None, config: "FitConfig") -> ClusterFit:
     """The Fit of one edge: its line or arc as it is, if the paper's ratio of errors keeps the arc, or `fit_cluster`."""
     if arc is None:
         return fit_cluster(points, config)

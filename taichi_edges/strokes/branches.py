@@ -18,7 +18,7 @@ LEAST_BESIDE = 3e-3  # unit-cube units
 PATH_SPACING = 1e-3  # unit-cube units between the samples of the walk
 
 
-def separate_branches(points, labels, min_points):
+def separate_branches(points: np.ndarray, labels: np.ndarray, min_points: int) -> np.ndarray:
     """Relabel forking clusters so that every cluster is one chain, open or closed.
 
     points: (n, 3) unit cube. labels: (n,) ints, UNASSIGNED for none. Branches below min_points become UNASSIGNED.
@@ -37,7 +37,7 @@ def separate_branches(points, labels, min_points):
     return separated
 
 
-def longest_walk(points):
+def longest_walk(points: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     """(n,) bool: the points on or beside the longest walk; and the connected groups of the others, as index arrays."""
     graph = connected_graph(points)
     start = extremity(graph)
@@ -60,7 +60,7 @@ def longest_walk(points):
     return on_walk, [rest[members] for members in members_of_clusters(groups)]
 
 
-def _walk(before, end):
+def _walk(before: np.ndarray, end: int) -> np.ndarray:
     """Indices from the source of a Dijkstra search to `end`."""
     walk = [end]
     while before[walk[-1]] >= 0:
@@ -68,7 +68,7 @@ def _walk(before, end):
     return np.array(walk[::-1])
 
 
-def _densified(corners):
+def _densified(corners: np.ndarray) -> np.ndarray:
     """Samples PATH_SPACING apart along the polyline through (m, 3) corners."""
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     arc = np.concatenate([[0.0], np.cumsum(lengths)])
@@ -76,7 +76,7 @@ def _densified(corners):
     return np.stack([np.interp(at, arc, corners[:, axis]) for axis in range(3)], axis=1)
 
 
-def scatter(points):
+def scatter(points: np.ndarray) -> float:
     """How far (n, 3) points lie beside their own edge: median over all of the second axis of their neighbourhoods."""
     count = min(SCATTER_NEIGHBORS, len(points))
     near = points[cKDTree(points).query(points, count)[1]]

@@ -7,6 +7,7 @@ that remain are the other edges. Points at a contact are claimed by one and shar
 """
 
 import heapq
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -15,7 +16,7 @@ import numpy as np
 from taichi_edges.fitting.arc_batch import ArcBatch
 from taichi_edges.fitting.arcs import Arc, fit_arc
 from taichi_edges.fitting.prices import price_of_arc
-from taichi_edges.strokes.arc_growth import INLIER, Inliers, grown_from_seeds, unbroken
+from taichi_edges.strokes.arc_growth import INLIER, Cloud, Inliers, grown_from_seeds, unbroken
 
 OUTLIER = INLIER**2  # squared noises: what a point on an edge brings at most
 OWN_SHARE = 0.5  # of the points along a stretch, which must be an arc's own: elsewhere it repeats another
@@ -45,7 +46,7 @@ class Claim:
     shared: np.ndarray
 
     @property
-    def members(self):
+    def members(self) -> np.ndarray:
         """All of its points."""
         return np.concatenate([self.own, self.shared])
 
@@ -53,22 +54,25 @@ class Claim:
 class Ledger:
     """Who owns each point, (n,) ints, -1 for nobody; and the noise at which it was claimed, (n,) unit-cube units."""
 
-    def __init__(self, count):
+    def __init__(self, count: int) -> None:
         self.owner, self.noise = np.full(count, -1), np.full(count, np.inf)
 
-    def enter(self, members, owner, noise):
+    def enter(self, members: np.ndarray, owner: int, noise: float) -> None:
         """The points in `members` now belong to `owner`."""
         self.owner[members], self.noise[members] = owner, noise
 
 
-def claims(cloud, neighbors, seeds, min_points):
+def claims(
+    cloud: Cloud, neighbors: Sequence[np.ndarray], seeds: np.ndarray, min_points: int
+) -> tuple[list[Claim], Ledger]:
     """Claims of lines and arcs that own disjoint points; and the Ledger that says so.
 
     neighbors: for every point its aligned neighbours, an index array. seeds: (n,) indices, best first.
     Edges that few views see are noisier than others. Their turn comes when the sharp ones have their points: in every
     round the tolerance is COARSER times that of the round before, and what is found already grows first.
     """
-    ledger, found, finest = Ledger(len(cloud.points)), [], cloud.scale.noise
+    found: list[Claim] = []
+    ledger, finest = Ledger(len(cloud.points)), cloud.scale.noise
     for number in range(ROUNDS):
         noise = finest * COARSER**number
         if number and noise > MOST_NOISE:
@@ -80,15 +84,23 @@ def claims(cloud, neighbors, seeds, min_points):
     return [refined(cloud, claim, ledger) for claim in found], ledger
 
 
-def claim_round(cloud, neighbors, seeds, min_points, ledger, found):
+def claim_round(
+    cloud: Cloud,
+    neighbors: Sequence[np.ndarray],
+    seeds: np.ndarray,
+    min_points: int,
+    ledger: Ledger,
+    found: list[Claim],
+) -> None:
     """Add to the Claims in `found`, and to the Ledger, what can be claimed at the cloud's scale."""
-    waiting, owner = [], ledger.owner
+    waiting: list[tuple[float, int, Grown]] = []
+    owner = ledger.owner
     for number, (gain, candidate) in enumerate(arc_candidates(cloud, neighbors, seeds, min_points, owner)):
         heapq.heappush(waiting, (-gain, number, candidate))
     while waiting:
         _, number, candidate = heapq.heappop(waiting)
         gain, claim = supported(cloud, candidate, owner, min_points)
-        if gain <= 0:
+        if claim is None or gain <= 0:
             continue
         if waiting and gain < -waiting[0][0]:  # others have claimed its points: let it wait for its new turn
             heapq.heappush(waiting, (-gain, number, candidate))
@@ -97,7 +109,7 @@ def claim_round(cloud, neighbors, seeds, min_points, ledger, found):
         found.append(claim)
 
 
-def widened(cloud, claim, ledger, number, beyond):
+def widened(cloud: Cloud, claim: Claim, ledger: Ledger, number: int, beyond: float) -> Claim:
     """The Claim with the points that nobody owns and that lie on it at the cloud's scale; the Ledger is told.
 
     beyond: how far it may go on past its ends, without a longer step, unit-cube units.
@@ -118,7 +130,7 @@ def widened(cloud, claim, ledger, number, beyond):
     return Claim(arc.over(*ends), np.union1d(claim.own, members), np.setdiff1d(claim.shared, members))
 
 
-def refined(cloud, claim, ledger):
+def refined(cloud: Cloud, claim: Claim, ledger: Ledger) -> Claim:
     """The Claim with its arc fitted once more to all of its points, each as sharply as it was claimed."""
     members, noises = claim.members, ledger.noise[claim.members]
     places, directions = cloud.points[members], cloud.directions[members]
@@ -128,7 +140,9 @@ def refined(cloud, claim, ledger):
     return Claim(arc, claim.own, claim.shared)
 
 
-def arc_candidates(cloud, neighbors, seeds, min_points, owner):
+def arc_candidates(
+    cloud: Cloud, neighbors: Sequence[np.ndarray], seeds: np.ndarray, min_points: int, owner: np.ndarray
+) -> Iterator[tuple[float, Grown]]:
     """Gains and Grown, one seed after the other until every point that nobody owns is on an arc, or has grown none."""
     covered = owner >= 0
     for seed, grown in grown_pairs(cloud, neighbors, seeds, covered):
@@ -141,7 +155,9 @@ def arc_candidates(cloud, neighbors, seeds, min_points, owner):
                 yield gain, candidate
 
 
-def grown_pairs(cloud, neighbors, seeds, covered):
+def grown_pairs(
+    cloud: Cloud, neighbors: Sequence[np.ndarray], seeds: np.ndarray, covered: np.ndarray
+) -> Iterator[tuple[int, list[Grown]]]:
     """(seed, list of its Grown) of one seed after the other that is not covered when its turn comes.
 
     covered: (n,) bool, which changes meanwhile. Arcs of seeds that are covered by then are dropped; where that were
@@ -162,7 +178,7 @@ def grown_pairs(cloud, neighbors, seeds, covered):
         count = min(2 * count, MOST_AT_ONCE) if used >= USED * len(some) else max(count // 2, LEAST_AT_ONCE)
 
 
-def with_inliers(cloud, arcs):
+def with_inliers(cloud: Cloud, arcs: Sequence[Arc]) -> list[Grown]:
     """A list of Grown from Arcs."""
     if not arcs:
         return []
@@ -172,7 +188,7 @@ def with_inliers(cloud, arcs):
     return [Grown(arc, on.keep(slice(*part))) for arc, part in zip(arcs, pairwise(bounds), strict=True)]
 
 
-def supported(cloud, candidate, owner, min_points):
+def supported(cloud: Cloud, candidate: Grown, owner: np.ndarray, min_points: int) -> tuple[float, Claim | None]:
     """What a Grown arc gains by the points that nobody owns, net of its price; and its Claim on them.
 
     A stretch counts where most points along it are its own. Shared points carry it across a contact, no farther.
@@ -192,7 +208,7 @@ def supported(cloud, candidate, owner, min_points):
     return gain, Claim(whole, members[own], members[kept & ~own])
 
 
-def _own_stretches(along, own, gap):
+def _own_stretches(along: np.ndarray, own: np.ndarray, gap: float) -> np.ndarray:
     """(n,) bool: the points of an arc's own stretches and between them.
 
     A stretch lies between gaps in the own points, and these are the majority of its points. Stretches are one where
@@ -205,7 +221,7 @@ def _own_stretches(along, own, gap):
     first, last = np.searchsorted(along[order], lows), np.searchsorted(along[order], highs, side="right")
     owned = np.concatenate([[0], np.cumsum(own[order])])
     good = owned[last] - owned[first] >= OWN_SHARE * (last - first)
-    spans = []
+    spans: list[tuple[float, float, float]] = []  # from, to, length of the stretches
     for low, high in zip(lows[good], highs[good], strict=True):
         if spans and low - spans[-1][1] <= high - low + spans[-1][2]:
             spans[-1] = (spans[-1][0], high, spans[-1][2] + high - low)

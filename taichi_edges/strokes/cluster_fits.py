@@ -1,16 +1,21 @@
 """One parametric edge for each cluster: a line segment, or a smooth chain of cubic Bezier curves (paper 3.3)."""
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from taichi_edges.arrays.robust import geman_mcclure
-from taichi_edges.fitting.cubic_chains import corrected_error, fewest_cubics, fit_chain
+from taichi_edges.fitting.cubic_chains import Ordering, corrected_error, fewest_cubics, fit_chain
 from taichi_edges.geometry.bezier import evaluate_bezier
-from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
+from taichi_edges.geometry.shapes import Line, Shape, Spline
 from taichi_edges.geometry.wireframe import Wireframe
 from taichi_edges.strokes.ordering import order_points
+
+if TYPE_CHECKING:
+    from taichi_edges.scene.settings import FitConfig
 
 ROBUST_ROUNDS = 10
 POINTS_PER_PIECE = 6  # at least
@@ -27,17 +32,17 @@ class ClusterFit:
     """What became of one cluster: a shape of kind 'line', 'curve' or 'loop' (closed); 'short' or 'degenerate': None."""
 
     kind: str
-    shape: Line | EllipticArc | Spline | None = None
+    shape: Shape | None = None
 
 
-def wireframe_of(fits):
+def wireframe_of(fits: Iterable[ClusterFit]) -> tuple[Wireframe, dict[str, int]]:
     """The loose Wireframe of some Fits, and the dict kind -> how many there are."""
     fits = list(fits)
     counts = dict.fromkeys(("line", "curve", "loop", "short", "degenerate"), 0) | Counter(fit.kind for fit in fits)
     return Wireframe.loose([fit.shape for fit in fits if fit.shape is not None]), counts
 
 
-def fit_cluster(points, config):
+def fit_cluster(points: np.ndarray, config: "FitConfig") -> ClusterFit:
     """Fit (n, 3) points: the curve is kept when its error e_c <= delta * e_l, the line's (paper 3.3).
 
     Errors are mean distances, corrected for the parameters (`corrected_error`): a curve through few points is close to
@@ -57,7 +62,7 @@ def fit_cluster(points, config):
     return ClusterFit("line", Line(line))
 
 
-def fit_line(points, tolerance):
+def fit_line(points: np.ndarray, tolerance: float) -> tuple[np.ndarray, float]:
     """Robust line segment through (n, 3) points: iteratively reweighted least squares (Geman-McClure).
 
     tolerance: distance at which a point's weight has fallen to a quarter.
@@ -79,7 +84,7 @@ def fit_line(points, tolerance):
     return centre + ends[:, None] * direction, corrected_error(distances, LINE_PARAMETERS)
 
 
-def fit_curve(points, ordering, tolerance):
+def fit_curve(points: np.ndarray, ordering: Ordering, tolerance: float) -> tuple[np.ndarray, float]:
     """Chain of cubic Beziers through (n, 3) points by robust least squares over the arc-length parameter.
 
     The chain is a cubic spline with a continuous tangent, cut into its Bezier pieces; as many pieces as the points'

@@ -4,6 +4,7 @@ import zipfile
 import zlib
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -66,10 +67,11 @@ def read_clusters(path: Path) -> Clusters:
         raise UserError(f"{path}: {problem}; run again with --stage cluster") from error
 
 
-NO_POINTS = Clusters.of(*np.zeros((2, 0, 3)), np.zeros(0, np.int64))
+# Its arrays tell the kind, and the shape of a row, of each array in a file.
+NO_POINTS = Clusters.of(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64))
 
 
-def _arrays(clusters):
+def _arrays(clusters: Clusters) -> dict[str, Any]:
     """{name: array} of the file. Columns `arc_..` have a row for each edge that has an Arc."""
     arcs = ArcBatch.of([arc for arc in clusters.arcs if arc is not None])
     return {
@@ -82,7 +84,7 @@ def _arrays(clusters):
     }
 
 
-def _checked(arrays):
+def _checked(arrays: dict[str, np.ndarray]) -> Clusters:
     """The Clusters of what the file holds; ValueError where that does not fit together."""
     for name, like in _arrays(NO_POINTS).items():
         array = arrays[name]

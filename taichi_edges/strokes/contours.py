@@ -11,10 +11,19 @@ ratio: a line that few views see must be the steadier, and one whose edgels othe
 From similar directions even a contour looks steady: a line must be seen from directions LEAST_ANGLE apart.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from taichi_edges.evidence.lying import EdgelsAbout
 from taichi_edges.strokes.neighbors import members_of_clusters
+
+if TYPE_CHECKING:
+    from taichi_edges.evidence.edgel_matching import EdgelMatching
+    from taichi_edges.evidence.explaining import Explained
+    from taichi_edges.scene.settings import FilterConfig
+    from taichi_edges.strokes.clusters import Clusters
+    from taichi_edges.views.views import Views
 
 ABOUT = 6.0  # an edgel is near a line within so many times the distance at which it is on it
 OWNED_PX = 1.0  # an edge explains the edgels so near to it
@@ -28,7 +37,9 @@ WIDE_ANGLE = np.radians(45.0)  # seen over so much to either side, only a contou
 LEAST_DOUBT = 1e-6  # of a share, from 0 and 1
 
 
-def without_contours(clusters, explained, views, config):
+def without_contours(
+    clusters: "Clusters", explained: "Explained | None", views: "Views", config: "FilterConfig"
+) -> "tuple[Clusters, int]":
     """The Clusters without what are no edges but contours, and the number of these. Arguments as for `steady_edges`.
 
     explained: None where nothing is known of the points' edgels; then all stays. config: the scene's `filter` section.
@@ -42,7 +53,9 @@ def without_contours(clusters, explained, views, config):
     return clusters.keep(edges), int((~edges).sum())
 
 
-def steady_edges(matching, clusters, explained, least, angle=LEAST_ANGLE):
+def steady_edges(
+    matching: "EdgelMatching", clusters: "Clusters", explained: "Explained", least: float, angle: float = LEAST_ANGLE
+) -> np.ndarray:
     """(m,) bool: the clusters that are edges, and not where contours pass by.
 
     matching: EdgelMatching. clusters: Clusters. explained: Explained of their points. least: log likelihood ratio from
@@ -70,7 +83,7 @@ def steady_edges(matching, clusters, explained, least, angle=LEAST_ANGLE):
     return edges
 
 
-def likelihood_ratio(on, about, usual):
+def likelihood_ratio(on: float, about: float, usual: float) -> float:
     """Log likelihood ratio of an edge over what is none, which has no more than the `usual` share of its edgels on it.
 
     on, about: numbers of views. The share of an edge is not known, so it is what it is found to be.

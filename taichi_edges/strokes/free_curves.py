@@ -5,11 +5,14 @@ points a smooth chain of cubics describes better than the lines and arcs do, the
 `merging`, over all points of the chain: one that no piece comes near counts as an outlier of theirs.
 """
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from taichi_edges.fitting.cubic_chains import fewest_cubics, fit_chain, nearest_on_chain
 from taichi_edges.fitting.prices import CUBIC_PRICE, NEXT_CUBIC_PRICE, price_of_arc
-from taichi_edges.strokes.arc_growth import INLIER
+from taichi_edges.strokes.arc_growth import INLIER, Cloud
 from taichi_edges.strokes.branches import separate_branches
 from taichi_edges.strokes.claiming import OUTLIER
 from taichi_edges.strokes.cluster_fits import POINTS_PER_PIECE
@@ -17,16 +20,21 @@ from taichi_edges.strokes.clustering import grow_clusters
 from taichi_edges.strokes.neighbors import members_of_clusters
 from taichi_edges.strokes.ordering import order_points
 
+if TYPE_CHECKING:
+    from taichi_edges.scene.settings import ClusterConfig
+    from taichi_edges.strokes.merging import Piece
+
 WITHIN = 0.9  # of a piece's points, which must be the chain's for the piece to be one of its own
 
 
-def free_curves(cloud, pieces, config):
+def free_curves(cloud: Cloud, pieces: "Sequence[Piece]", config: "ClusterConfig") -> tuple[list[np.ndarray], set[int]]:
     """The point indices of every free curve, and the set of the numbers of the pieces that these replace.
 
     cloud: Cloud. pieces: list of Pieces. config: the scene's `cluster` section. A chain that runs on into a piece it
     does not cover leaves that its points: it explains them already.
     """
-    curves, replaced = [], set()
+    curves: list[np.ndarray] = []
+    replaced: set[int] = set()
     piece_at = np.full(len(cloud.points), -1)
     for number, piece in enumerate(pieces):
         piece_at[piece.own] = number
@@ -43,27 +51,27 @@ def free_curves(cloud, pieces, config):
     return curves, replaced
 
 
-def cost_of_pieces(cloud, pieces, members):
+def cost_of_pieces(cloud: Cloud, pieces: "Sequence[Piece]", members: np.ndarray) -> float:
     """BIC of the pieces as a description of the points in `members`."""
     best = np.full(len(members), OUTLIER)
     for piece in pieces:
         if piece.arc is not None:
             distances = np.linalg.norm(piece.arc.coordinates(cloud.points[members])[1], axis=1)
         else:
-            distances, _ = nearest_on_chain(cloud.points[members], piece.curves)
+            distances, _ = nearest_on_chain(cloud.points[members], piece.chain)
         mine = np.isin(members, piece.members)
         best[mine] = np.minimum(best[mine], (distances[mine] / cloud.scale.noise) ** 2)
     return best.sum() + sum(price_of(piece) for piece in pieces) * np.log(len(members))
 
 
-def price_of(piece):
+def price_of(piece: "Piece") -> int:
     """Number of free parameters of a Piece."""
-    return (
-        price_of_arc(piece.arc) if piece.arc is not None else CUBIC_PRICE + NEXT_CUBIC_PRICE * (len(piece.curves) - 1)
-    )
+    if piece.arc is not None:
+        return price_of_arc(piece.arc)
+    return CUBIC_PRICE + NEXT_CUBIC_PRICE * (len(piece.chain) - 1)
 
 
-def cost_of_chain(cloud, members, worth):
+def cost_of_chain(cloud: Cloud, members: np.ndarray, worth: float) -> float:
     """BIC of the best smooth chain of cubics through the points in `members`, if it can be below `worth`; else inf."""
     points, best = cloud.points[members], np.inf
     ordering = order_points(points)

@@ -7,6 +7,7 @@ several arcs is one cubic; a fillet between two lines stays three edges, because
 
 import heapq
 import itertools
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +15,12 @@ import numpy as np
 from taichi_edges.fitting.arcs import Arc, fit_arc
 from taichi_edges.fitting.cubic_chains import Ordering, fit_chain, nearest_on_chain
 from taichi_edges.fitting.prices import CUBIC_PRICE, MOST_CUBICS, NEXT_CUBIC_PRICE, price_of_arc
-from taichi_edges.strokes.arc_growth import INLIER, SAGITTA, sagitta
-from taichi_edges.strokes.claiming import OUTLIER
+from taichi_edges.strokes.arc_growth import INLIER, SAGITTA, Cloud, sagitta
+from taichi_edges.strokes.claiming import OUTLIER, Claim
 
 WIDE = 4.0  # times the tolerance: the first fit to two pieces starts from one of them, and looks farther
+
+NumberedEnd = tuple[int, int]  # number of the piece, side 0 or 1
 
 
 @dataclass(frozen=True)
@@ -36,37 +39,44 @@ class Piece:
     cost: float
 
     @property
-    def members(self):
+    def members(self) -> np.ndarray:
         """All of its points."""
         return np.concatenate([self.own, self.shared])
 
     @property
-    def closed(self):
+    def chain(self) -> np.ndarray:
+        """The `curves` of what is no arc."""
+        assert self.curves is not None
+        return self.curves
+
+    @property
+    def closed(self) -> bool:
         """Has it no ends?"""
         return self.arc is not None and self.arc.closed
 
     @property
-    def cubics(self):
+    def cubics(self) -> int:
         """How many cubics describe it."""
         if self.arc is None:
-            return len(self.curves)
+            return len(self.chain)
         return max(int(np.ceil(self.arc.length * self.arc.curvature / (0.5 * np.pi))), 1)
 
-    def ends(self):
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
         """(2, 3) its two ends, and (2, 3) the tangents there, both pointing outwards."""
         if self.arc is not None:
             at = np.array([self.arc.low, self.arc.high])
             return self.arc.at(at), self.arc.tangents(at) * np.array([[-1.0], [1.0]])
-        places = np.stack([self.curves[0, 0], self.curves[-1, 3]])
-        tangents = np.stack([self.curves[0, 0] - self.curves[0, 1], self.curves[-1, 3] - self.curves[-1, 2]])
+        curves = self.chain
+        places = np.stack([curves[0, 0], curves[-1, 3]])
+        tangents = np.stack([curves[0, 0] - curves[0, 1], curves[-1, 3] - curves[-1, 2]])
         return places, tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-300)
 
-    def lengths(self):
+    def lengths(self) -> tuple[np.ndarray, np.ndarray]:
         """Arc lengths of its points, at least in order of size; and (2,) those of its ends."""
         if self.arc is not None:
             return self.along, np.array([self.arc.low, self.arc.high])
-        scale = np.linalg.norm(np.diff(self.curves, axis=1), axis=2).sum() / len(self.curves)
-        return self.along * scale, np.array([0.0, len(self.curves)]) * scale
+        scale = np.linalg.norm(np.diff(self.chain, axis=1), axis=2).sum() / len(self.chain)
+        return self.along * scale, np.array([0.0, len(self.chain)]) * scale
 
 
 @dataclass(frozen=True)
@@ -76,27 +86,28 @@ class End:
     piece: Piece
     side: int
 
-    def ways(self):
+    def ways(self) -> np.ndarray:
         """Arc lengths of the piece's points, see `Piece.lengths`, counted outwards from this end."""
         along, ends = self.piece.lengths()
         return (along - ends[self.side]) * (1 if self.side else -1)
 
 
-def merged(cloud, claims, noises):
+def merged(cloud: Cloud, claims: Sequence[Claim], noises: np.ndarray) -> list[Piece]:
     """Pieces of whole edges from Claims, see `claiming`.
 
     cloud: Cloud. noises: (n,) at which each point was claimed, unit-cube units.
     """
     cloud = cloud.with_noises(noises)
     pieces = {number: piece_of(cloud, claim.arc, claim.own, claim.shared) for number, claim in enumerate(claims)}
-    waiting, turns, count, ends = [], itertools.count(), len(pieces), EndGrid(cloud.scale.gap)
+    waiting: list[tuple[float, int, int, int, Piece]] = []
+    turns, count, ends = itertools.count(), len(pieces), EndGrid(cloud.scale.gap)
 
-    def propose(some):
+    def propose(some: Sequence[int]) -> None:
         for number in some:
             ends.add(number, pieces[number])
         for a, b in piece_joints(cloud, pieces, ends, some):
             gain, piece = joined(cloud, End(pieces[a[0]], a[1]), End(pieces[b[0]], b[1]))
-            if gain > 0:
+            if piece is not None:
                 heapq.heappush(waiting, (-gain, a[0], b[0], next(turns), piece))
 
     propose(list(pieces))
@@ -110,7 +121,7 @@ def merged(cloud, claims, noises):
     return [pieces[number] for number in sorted(pieces)]
 
 
-def piece_of(cloud, arc, own, shared):
+def piece_of(cloud: Cloud, arc: Arc, own: np.ndarray, shared: np.ndarray) -> Piece:
     """The Piece of an arc and its points."""
     members = np.concatenate([own, shared])
     along, offsets = arc.coordinates(cloud.points[members])
@@ -118,7 +129,7 @@ def piece_of(cloud, arc, own, shared):
     return Piece(arc, None, own, shared, along, cost)
 
 
-def capped(squared, noises):
+def capped(squared: np.ndarray, noises: np.ndarray) -> float:
     """Sum of (n,) squared distances in units of the noises, (n,), each at most OUTLIER."""
     return float(np.minimum(squared / noises**2, OUTLIER).sum())
 
@@ -126,17 +137,19 @@ def capped(squared, noises):
 class EndGrid:
     """The ends of open pieces in cubes of side `reach`: which are near an end is asked again after every joining."""
 
-    def __init__(self, reach):
-        self.reach, self.ends, self.cells = reach, {}, {}
+    def __init__(self, reach: float) -> None:
+        self.reach = reach
+        self.ends: dict[NumberedEnd, tuple[np.ndarray, np.ndarray]] = {}  # places and tangents
+        self.cells: dict[tuple[int, ...], list[NumberedEnd]] = {}
 
-    def add(self, number, piece):
+    def add(self, number: int, piece: Piece) -> None:
         """Add the two ends of a Piece of some number, if it has any."""
         if not piece.closed:
             for side, (place, tangent) in enumerate(zip(*piece.ends(), strict=True)):
                 self.ends[number, side] = place, tangent
                 self.cells.setdefault(self._cell(place), []).append((number, side))
 
-    def near(self, end):
+    def near(self, end: NumberedEnd) -> list[NumberedEnd]:
         """Ends (number, side) within reach of one of them, itself included."""
         place = self.ends[end][0]
         corner = np.array(self._cell(place)) - 1
@@ -145,11 +158,13 @@ class EndGrid:
         apart = np.linalg.norm([self.ends[other][0] - place for other in around], axis=1)
         return [other for other, distance in zip(around, apart, strict=True) if distance <= self.reach]
 
-    def _cell(self, place):
+    def _cell(self, place: np.ndarray) -> tuple[int, ...]:
         return tuple(np.floor(place / self.reach).astype(int).tolist())
 
 
-def piece_joints(cloud, pieces, grid, some):
+def piece_joints(
+    cloud: Cloud, pieces: Mapping[int, Piece], grid: EndGrid, some: Iterable[int]
+) -> list[tuple[NumberedEnd, NumberedEnd]]:
     """Pairs of ends that are near and look at each other, each (number of the piece, 0 or 1); one of them in `some`.
 
     grid: EndGrid of all pieces, and of some that are gone.
@@ -163,7 +178,7 @@ def piece_joints(cloud, pieces, grid, some):
     return sorted(found)
 
 
-def joined(cloud, end, other):
+def joined(cloud: Cloud, end: End, other: End) -> tuple[float, Piece | None]:
     """What it gains to make the pieces of two Ends one, and that Piece; 0 and None where it does not pay."""
     a, b = end.piece, other.piece
     own = np.union1d(a.own, b.own)
@@ -177,7 +192,7 @@ def joined(cloud, end, other):
     return (gain, best) if gain > 0 else (0.0, None)
 
 
-def arc_piece(cloud, start, own, shared, straight):
+def arc_piece(cloud: Cloud, start: Arc, own: np.ndarray, shared: np.ndarray, straight: bool) -> Piece | None:
     """The points of two pieces as one line or arc; None where it bends too little for an arc."""
     members, scale = np.concatenate([own, shared]), cloud.scale
     points, directions, noises = cloud.points[members], cloud.directions[members], cloud.noises[members]
@@ -196,7 +211,7 @@ def arc_piece(cloud, start, own, shared, straight):
     return piece_of(cloud, arc.recentred(), own, shared)
 
 
-def free_piece(cloud, end, other, own, shared):
+def free_piece(cloud: Cloud, end: End, other: End, own: np.ndarray, shared: np.ndarray) -> Piece | None:
     """The points of two pieces as a smooth chain of as few cubics as pay; see `joined`."""
     members = np.concatenate([own, shared])
     points, noises = cloud.points[members], cloud.noises[members]
@@ -213,7 +228,7 @@ def free_piece(cloud, end, other, own, shared):
     return best
 
 
-def chained(end, other, members):
+def chained(end: End, other: End, members: np.ndarray) -> Ordering:
     """Ordering of the members of two pieces: along the one to its End, on from the other End along the other."""
     (places, outwards), (other_places, _) = end.piece.ends(), other.piece.ends()
     gap = (other_places[other.side] - places[end.side]) @ outwards[end.side]

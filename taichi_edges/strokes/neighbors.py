@@ -7,7 +7,7 @@ import numpy as np
 UNASSIGNED = -1
 
 
-def members_of_clusters(labels):
+def members_of_clusters(labels: np.ndarray) -> list[np.ndarray]:
     """The points of every cluster: a list of ascending index arrays, one for each of the labels 0, 1, ..
 
     labels: (n,) ints, UNASSIGNED for none. One sort, however many clusters there are.
@@ -29,7 +29,7 @@ class NeighborGraph:
     distances: np.ndarray
 
 
-def neighbor_graph(points, count, reach):
+def neighbor_graph(points: np.ndarray, count: int, reach: float) -> NeighborGraph:
     """NeighborGraph of (n, 3) points: at most `count` neighbours within `reach`, from Open3D's KD-tree."""
     import open3d as o3d
 
@@ -44,7 +44,7 @@ def neighbor_graph(points, count, reach):
     return NeighborGraph(indices, offsets, distances)
 
 
-def alignment(directions, graph):
+def alignment(directions: np.ndarray, graph: NeighborGraph) -> np.ndarray:
     """(n, k) |d_j . (x_j - x_i)| / |x_j - x_i|: does the neighbour's orientation follow the line that joins the two?
 
     Neighbours at the very same place count as aligned.

@@ -5,8 +5,11 @@ along an edge. What counts is how far the points of a whole line or arc are off 
 tolerance that is raised until it no longer cuts off what it measures.
 """
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 
+from taichi_edges.fitting.arcs import Arc
 from taichi_edges.strokes.arc_growth import Cloud, Scale, grown_from_seeds
 
 PROBES = 20  # seeds from which lines and arcs are grown
@@ -19,7 +22,14 @@ RAYLEIGH = 1.1774  # median distance over the standard deviation on each axis, o
 LEAST_TURN, FIRST_TURN = np.radians([0.5, 5.0])  # of directions: at least, and until they have been measured
 
 
-def measured_scale(points, directions, neighbors, seeds, gap, most=MOST_NOISE):
+def measured_scale(
+    points: np.ndarray,
+    directions: np.ndarray,
+    neighbors: Sequence[np.ndarray],
+    seeds: np.ndarray,
+    gap: float,
+    most: float = MOST_NOISE,
+) -> Scale:
     """The Scale of oriented points.
 
     points, directions: (n, 3). neighbors: for every point its aligned neighbours. seeds: (n,) indices, best first.
@@ -44,7 +54,7 @@ def measured_scale(points, directions, neighbors, seeds, gap, most=MOST_NOISE):
     return Scale(min(noise, most), turn, gap)
 
 
-def _residuals(cloud, pair):
+def _residuals(cloud: Cloud, pair: tuple[Arc | None, Arc | None]) -> Iterator[tuple[float, float, float]]:
     """(length, noise of the places, noise of the directions) of the line and the arc grown from one seed."""
     for grown in pair if pair[0] is not None else ():
         if grown is not None:

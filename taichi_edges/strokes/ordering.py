@@ -1,7 +1,7 @@
 """Order along a cluster: the arc length of every point, and whether the cluster closes on itself."""
 
 import numpy as np
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
@@ -14,7 +14,7 @@ WAIST = (0.25, 0.75)  # of the longest walk: an open edge is one strip here, a c
 SPAN = 0.6  # of the waist that a strip reaches through at least
 
 
-def order_points(points):
+def order_points(points: np.ndarray) -> Ordering:
     """Order the (n, 3) points of one cluster along their edge, by geodesic distance in their neighbour graph."""
     graph = connected_graph(points)
     start = extremity(graph)
@@ -26,12 +26,12 @@ def order_points(points):
     return _unroll(graph, from_start, length, strips)
 
 
-def extremity(graph):
+def extremity(graph: csr_array) -> int:
     """The point farthest along the graph from an arbitrary one: an end of an open edge."""
     return int(np.argmax(dijkstra(graph, indices=0)))
 
 
-def connected_graph(points):
+def connected_graph(points: np.ndarray) -> csr_array:
     """(n, n) sparse, symmetric graph of near neighbours that is connected: the spanning tree is always part of it."""
     count = min(GRAPH_NEIGHBORS + 1, len(points))
     distances, indices = cKDTree(points).query(points, count)
@@ -50,7 +50,7 @@ def connected_graph(points):
     return full
 
 
-def _bridge(points, graph, labels):
+def _bridge(points: np.ndarray, graph: csr_array, labels: np.ndarray) -> csr_array:
     """Join the pieces of a graph by their shortest connections, one piece after the other to that of label 0."""
     pieces = members_of_clusters(labels)
     newest, outside = pieces[0], np.flatnonzero(labels)
@@ -69,7 +69,7 @@ def _bridge(points, graph, labels):
     return graph.maximum(added).maximum(added.T)
 
 
-def two_sides(graph, from_start):
+def two_sides(graph: csr_array, from_start: np.ndarray) -> list[np.ndarray] | None:
     """The two strips (arrays of indices) of which a closed edge consists at its waist; None for an open edge.
 
     Each strip must reach through the whole waist, since a mere gap in an open edge leaves pieces that share it out; and
@@ -89,7 +89,7 @@ def two_sides(graph, from_start):
     return strips if set(sides[meeting[0]]) & set(sides[meeting[1]]) else None
 
 
-def _unroll(graph, from_start, length, strips):
+def _unroll(graph: csr_array, from_start: np.ndarray, length: float, strips: list[np.ndarray]) -> Ordering:
     """Arc length around a closed edge: out on one side (0 .. L), back on the other (L .. 2 L)."""
     # Which arm a point is on: the side whose waist it reaches without passing start or far end, that is, the nearer.
     nearest = [dijkstra(graph, indices=strip, min_only=True) for strip in strips]

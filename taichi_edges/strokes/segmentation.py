@@ -20,7 +20,7 @@ MIN_NOISE = 7e-4  # unit-cube units; detectors' errors vary slowly along an edge
 BLOCK = 1 << 13  # points of overlapping stretches that are looked at in one go; the intermediate arrays stay in cache
 
 
-def split_clusters(points, labels, min_points):
+def split_clusters(points: np.ndarray, labels: np.ndarray, min_points: int) -> np.ndarray:
     """Cut clusters into straight and curved stretches.
 
     points: (n, 3) unit cube. labels: (n,) ints, UNASSIGNED for none. min_points: smaller stretches stay with their
@@ -35,7 +35,7 @@ def split_clusters(points, labels, min_points):
     return split
 
 
-def stretches(points, min_points):
+def stretches(points: np.ndarray, min_points: int) -> list[np.ndarray]:
     """Index arrays of the straight and curved stretches of one cluster, in order along it."""
     if len(points) < 2 * min_points:
         return [np.arange(len(points))]
@@ -49,14 +49,14 @@ def stretches(points, min_points):
     return [np.concatenate([order[a:b] for a, b in group]) for group in groups]
 
 
-def _some_cut(chain):
+def _some_cut(chain: np.ndarray) -> int:
     """Position of a cut that an open chain gets at an end of a straight stretch; 0 where it gets none."""
     bounds, curved = cut_chain(chain)
     inner = [a for a, was, now in zip(bounds[1:-1], curved[:-1], curved[1:], strict=True) if was != now or not now]
     return inner[len(inner) // 2] if inner else 0
 
 
-def cut_chain(chain):
+def cut_chain(chain: np.ndarray) -> tuple[list[int], list[bool]]:
     """Cheapest sequence of lines and cubics through (n, 3) ordered points.
 
     Cost of a stretch: squared distances to its line or cubic in units of the noise, each at most OUTLIER, plus the
@@ -81,7 +81,9 @@ def cut_chain(chain):
     return [int(stations[i]) for i in path], [bool(was_curved[i]) for i in path[1:]]
 
 
-def stretch_costs(chain, starts, ends, noise):
+def stretch_costs(
+    chain: np.ndarray, starts: np.ndarray, ends: np.ndarray, noise: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Squared distances, capped and summed, of the points of many stretches to their lines and to their cubics.
 
     chain: (n, 3) ordered points. starts, ends: (p,) ints, the stretches are chain[start:end].
@@ -98,7 +100,7 @@ def stretch_costs(chain, starts, ends, noise):
     return costs[0], costs[1]
 
 
-def _block_costs(chain, starts, ends, noise):
+def _block_costs(chain: np.ndarray, starts: np.ndarray, ends: np.ndarray, noise: float) -> np.ndarray:
     """(2, p) costs of the stretches of one block; see `stretch_costs`. t counts all their points, in order."""
     lengths = ends - starts
     of, place = ragged(lengths)  # (t,) the stretch, and 0, 1, .. within it
@@ -106,7 +108,8 @@ def _block_costs(chain, starts, ends, noise):
     means = np.diff(_running_sums(chain)[np.stack([starts, ends])], axis=0)[0] / lengths[:, None]
     offsets = chain[starts[of] + place].T - np.repeat(means.T, lengths, axis=1)  # (3, t)
 
-    def capped(residuals, directions):  # (3, t) each; what lies along the direction is no distance
+    # residuals, directions: (3, t) each; what lies along the direction is no distance
+    def capped(residuals: np.ndarray, directions: np.ndarray) -> np.ndarray:
         along = (residuals * directions).sum(axis=0) ** 2 / np.maximum((directions**2).sum(axis=0), 1e-300)
         squared = (residuals**2).sum(axis=0) - along
         return np.add.reduceat(np.minimum(np.maximum(squared, 0.0) / noise**2, OUTLIER), first)
@@ -128,12 +131,12 @@ def _block_costs(chain, starts, ends, noise):
     return np.stack([lines, capped(offsets - cubics, directions)])
 
 
-def _running_sums(values):
+def _running_sums(values: np.ndarray) -> np.ndarray:
     """(n, ...) -> (n + 1, ...) sums of the first 0 .. n values."""
     return np.concatenate([np.zeros_like(values[:1]), np.cumsum(values, axis=0)])
 
 
-def _main_directions(chain, starts, ends, means):
+def _main_directions(chain: np.ndarray, starts: np.ndarray, ends: np.ndarray, means: np.ndarray) -> np.ndarray:
     """(p, 3) unit vectors along which the stretches scatter most."""
     sums = _running_sums(chain[:, :, None] * chain[:, None, :])
     moments = sums[ends] - sums[starts]
@@ -141,7 +144,7 @@ def _main_directions(chain, starts, ends, means):
     return np.linalg.eigh(scatter)[1][:, :, -1]
 
 
-def local_noise(chain):
+def local_noise(chain: np.ndarray) -> float:
     """Scatter of ordered (n, 3) points per axis across their edge: median over windows of NOISE_WINDOW points."""
     window = min(NOISE_WINDOW, len(chain))
     design = np.polynomial.legendre.legvander(np.linspace(-1, 1, window), 2)
@@ -155,9 +158,10 @@ def local_noise(chain):
     return float(np.sqrt(np.median(across / (2 * max(window - 3, 1)))))
 
 
-def _joined(bounds, curved, min_points, closed):
+def _joined(bounds: list[int], curved: list[bool], min_points: int, closed: bool) -> list[list[tuple[int, int]]]:
     """Stretches as lists of (start, end): neighbouring curved ones are one, tiny ones go to their neighbour."""
-    groups, kinds = [], []
+    groups: list[list[tuple[int, int]]] = []
+    kinds: list[bool] = []
     for start, end, is_curved in zip(bounds[:-1], bounds[1:], curved, strict=True):
         tiny = end - start < min_points
         if groups and (tiny or (is_curved and kinds[-1]) or sum(b - a for a, b in groups[-1]) < min_points):
