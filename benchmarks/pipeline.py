@@ -209,9 +209,8 @@ def main(arguments=None):
     of_each_seed = {key: [runs[0] for runs in of_seeds.values()] for key, of_seeds in found.items()}
     cache = "empty kernel cache" if options.cold else "kernels compiled before"
     seeds = "" if options.seeds == [None] else f" with each of the seeds {', '.join(map(str, options.seeds))}"
-    print(
-        f"{machine_line()}\n{options.arch}, {options.threads} threads, {cache}, medians of {options.repeats} runs{seeds}"
-    )
+    print(machine_line())
+    print(f"{options.arch}, {options.threads} threads, {cache}, medians of {options.repeats} runs{seeds}")
     heads = ["scene", "preset"]
     print("\nSeconds, and peak memory of the process:\n")
     columns = [*heads, "whole command", "of all threads", *STAGES, "outside stages", "peak MiB"]

@@ -113,7 +113,7 @@ class Consensus:
         corrected, weights = self.sides.correct(self.edgels, values)
         flags = np.where(weights >= CLEAR, 1.0, np.where(self.sides.interior, 0.0, np.nan))
 
-        def look(view: int) -> tuple[np.ndarray, ...]:
+        def look(view: int) -> Observations:
             owners, found = self._edgels_beside(view, corrected, reach)
             found += self.edgels.starts[view]
             owners, found = (array[np.isfinite(flags[found])] for array in (owners, found))

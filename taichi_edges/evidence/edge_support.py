@@ -73,7 +73,7 @@ class EdgeSamples:
 
 def spaced(shape: Shape, spacing: float) -> np.ndarray:
     """(n,) parameters in the middles of stretches of equal length, about `spacing` long."""
-    count = max(int(round(shape.length / spacing)), 1)
+    count = max(round(shape.length / spacing), 1)
     middles = (np.arange(count) + 0.5) / count
     if shape.kind in ("line", "arc", "circle"):
         return middles
@@ -116,8 +116,8 @@ class Claims:
 class Support:
     """The edgels of all views that are matched by the samples of some edges and owned by these.
 
-    samples: EdgeSamples. edgels: (n, V) index, -1 where there is none. residuals: (n, V) px. weights: (n, V) strength of
-    the edgel times closeness, that of Geman and McClure at the scale of the matching; 0 where there is none. claims:
+    samples: EdgeSamples. edgels: (n, V) index, -1 where there is none. residuals: (n, V) px. weights: (n, V) strength
+    of the edgel times closeness, that of Geman and McClure at the scale of the matching; 0 where there is none. claims:
     Claims. chance: sum of the weights that a place would have by chance. least_views: that must show an edge, each
     counted by its weight.
     """

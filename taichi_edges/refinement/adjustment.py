@@ -17,6 +17,7 @@ off, so the ends of an edge are where it meets others and not where its edgels e
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import methodcaller
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -187,7 +188,7 @@ def image_equations(problem: Problem, wireframe: Wireframe, matching: "EdgelMatc
     for number, unknowns in enumerate(problem.layout.columns):
         part = samples.of(number)
         parameters = samples.parameters[part]
-        slopes = derivatives(neighbors_of(wireframe, number), lambda shape: shape.at(parameters))  # (n, 3, k)
+        slopes = derivatives(neighbors_of(wireframe, number), methodcaller("at", parameters))  # (n, 3, k)
         before = samples.points[part] - problem.start.edges[number].shape.at(parameters)
         weight = 1.0 / (len(before) * (START_PX * pixel) ** 2)
         _add_places(equations, unknowns, slopes, planes[part] + weight * np.eye(3), pulls[part] + weight * before)

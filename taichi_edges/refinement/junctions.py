@@ -79,7 +79,7 @@ def connected(shapes: Sequence[Shape], pixel: float) -> Wireframe:
 def reach_of(number: int, shape: Shape, side: int, pixel: float) -> Reach:
     """The Reach of one end of a shape of some number."""
     inwards = min(REACH_PX * pixel, SHARE * shape.length)
-    count = int(round(inwards / (STEP_PX * pixel)))
+    count = round(inwards / (STEP_PX * pixel))
     ways = np.arange(-count, int(REACH_PX / STEP_PX) + 1) * STEP_PX * pixel
     points, tangents = along_end(shape, side, ways)
     return Reach(number, side, ways, points, tangents)

@@ -254,9 +254,9 @@ def _coaxial(wireframe: Wireframe, pixel: float) -> Iterator[Relation]:
     """Arcs and circles: the centre of one on the axis of the other."""
     for (one, a), (other, b) in combinations(_of_kind(wireframe, *ROUND), 2):
         axis = a[DIRECTION]
-        if np.linalg.norm(cross(axis, b[DIRECTION])) < np.sin(MOST_TURN):
-            if np.linalg.norm(cross(axis, b[PLACE] - a[PLACE])) < MOST_OFF_PX * pixel:
-                yield Relation("coaxial", (one, other), partial(_off_axis, _sides(axis)))
+        parallel = np.linalg.norm(cross(axis, b[DIRECTION])) < np.sin(MOST_TURN)
+        if parallel and np.linalg.norm(cross(axis, b[PLACE] - a[PLACE])) < MOST_OFF_PX * pixel:
+            yield Relation("coaxial", (one, other), partial(_off_axis, _sides(axis)))
 
 
 def _coplanar(wireframe: Wireframe, pixel: float) -> Iterator[Relation]:
@@ -279,9 +279,9 @@ def _plane_spans(wireframe: Wireframe, edges: dict[int, np.ndarray]) -> Iterator
     """Tuples of edges that span a plane: arcs and circles, then pairs of lines that share a vertex."""
     yield from ((number,) for number in edges if wireframe.shapes[number].kind != "line")
     for one, other in combinations([number for number in edges if wireframe.shapes[number].kind == "line"], 2):
-        if set(wireframe.edges[one].vertices) & set(wireframe.edges[other].vertices):
-            if np.linalg.norm(cross(edges[one][DIRECTION], edges[other][DIRECTION])) > 0.5:
-                yield one, other
+        meet = set(wireframe.edges[one].vertices) & set(wireframe.edges[other].vertices)
+        if meet and np.linalg.norm(cross(edges[one][DIRECTION], edges[other][DIRECTION])) > 0.5:
+            yield one, other
 
 
 def _plane(*span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

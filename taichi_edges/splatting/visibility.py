@@ -79,8 +79,8 @@ def mark_hidden(width: ti.i32, points: F32_2D, projections: F32_3D, edge_words: 
         h = load_camera(projections, view) @ load_point(points, i)
         if h[2] > 0:
             row, column = nearest_pixel(h)
-            if 0 <= row and row < hidden.shape[1] and 0 <= column and column < width:  # noqa: SIM300
-                if is_clear(view, row, column, edge_words):  # noqa: SIM102  Taichi's `and` evaluates both sides
+            if 0 <= row and row < hidden.shape[1] and 0 <= column and column < width:  # noqa: SIM102, SIM300
+                if is_clear(view, row, column, edge_words):  # apart: Taichi's `and` evaluates both sides
                     mark_disc(view, row, column, hidden)
 
 

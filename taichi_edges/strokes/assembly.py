@@ -1,5 +1,6 @@
 """From oriented points to the points of every edge: graph traversal, whole lines and arcs, what is left, merging."""
 
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -93,7 +94,7 @@ def sharers(shared: np.ndarray, count: int) -> list[np.ndarray]:
     """The points of each of `count` edges that they share with others: a list of index arrays."""
     order = np.argsort(shared[:, 1], kind="stable")
     bounds = np.searchsorted(shared[order, 1], np.arange(count + 1))
-    return [shared[order[start:end], 0] for start, end in zip(bounds[:-1], bounds[1:], strict=True)]
+    return [shared[order[start:end], 0] for start, end in pairwise(bounds)]
 
 
 def fit_edge(points: np.ndarray, arc: Arc | None, config: "FitConfig") -> ClusterFit:

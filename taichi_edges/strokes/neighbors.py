@@ -1,6 +1,7 @@
 """Neighbourhoods of oriented points, and the members of labelled clusters."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -14,7 +15,7 @@ def members_of_clusters(labels: np.ndarray) -> list[np.ndarray]:
     """
     order = np.argsort(labels, kind="stable")
     bounds = np.searchsorted(labels[order], np.arange(labels.max(initial=UNASSIGNED) + 2))
-    return [order[start:end] for start, end in zip(bounds[:-1], bounds[1:], strict=True)]
+    return [order[start:end] for start, end in pairwise(bounds)]
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ def cut_chain(chain: np.ndarray) -> tuple[list[int], list[bool]]:
     path = [len(stations) - 1]
     while path[-1]:
         path.append(came_from[path[-1]])
-    path = path[::-1]
+    path.reverse()
     return [int(stations[i]) for i in path], [bool(was_curved[i]) for i in path[1:]]
 
 
