@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 RUN := $(VENV)/bin/python
 
-.PHONY: help demo test setup lock clean
+.PHONY: help demo test lint setup lock clean
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo "Python 3.10 to 3.12; another one than $(PYTHON): make demo PYTHON=python3.12"
@@ -14,6 +14,11 @@ demo: setup ## run the embedded demo scene, no download; results in runs/demo/
 
 test: setup ## run all tests
 	$(RUN) -m pytest -q -rs
+
+lint: setup ## format, lint, types
+	$(RUN) -m ruff format --check --quiet .
+	$(RUN) -m ruff check --quiet .
+	$(RUN) -m mypy
 
 setup: $(VENV)/ready ## install what is needed into .venv (the other targets do so by themselves)
 	@sh tools/system-libraries $(RUN)
@@ -27,7 +32,7 @@ $(VENV)/ready: requirements.lock setup.cfg setup.py pyproject.toml
 	@touch $@
 
 lock: ## resolve requirements.lock anew from setup.cfg (needs uv)
-	uv pip compile --universal --python-version 3.10 --extra test --no-header --no-annotate --constraint tools/lock-constraints.txt setup.cfg --output-file requirements.lock
+	UV_CUSTOM_COMPILE_COMMAND="make lock" uv pip compile --universal --python-version 3.10 --extra test --extra lint --no-annotate --constraint tools/lock-constraints.txt setup.cfg --output-file requirements.lock
 
 clean: ## remove .venv and runs
 	rm -rf $(VENV) runs
