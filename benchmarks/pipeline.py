@@ -20,11 +20,11 @@ if not __package__:  # run as a script: the project's root takes the place of th
 
 from benchmarks.machine import benchmark_cache, compiled_kernels, machine_line, maxrss_mib
 from benchmarks.markdown import table
+from taichi_edges.corridor.loading import load_scene
 from taichi_edges.corridor.machine import available_threads
 from taichi_edges.corridor.pipeline import Run, with_reader
 from taichi_edges.corridor.stages import STAGES
 from taichi_edges.errors import UserError
-from taichi_edges.scene.scene_file import load_scene
 
 ROOT = Path(__file__).resolve().parent.parent
 METRICS = {

@@ -21,6 +21,7 @@ from benchmarks.machine import benchmark_cache, machine_line
 from benchmarks.markdown import table
 from benchmarks.pipeline import ROOT, missing_data
 from taichi_edges.corridor import cluster, evaluate, fit
+from taichi_edges.corridor.loading import load_scene
 from taichi_edges.corridor.machine import available_threads
 from taichi_edges.corridor.pipeline import Run, run_stages
 from taichi_edges.evidence.edge_support import support_along
@@ -31,7 +32,6 @@ from taichi_edges.refinement.completion import completed
 from taichi_edges.refinement.continuation import continued
 from taichi_edges.refinement.junctions import connected
 from taichi_edges.refinement.stage import refine_wireframe, whole_edges, yardstick_of
-from taichi_edges.scene.scene_file import load_scene
 from taichi_edges.strokes.assembly import assemble, fit_clusters
 from taichi_edges.strokes.clustering import grow_clusters
 from taichi_edges.strokes.clusters import Clusters, read_clusters

@@ -9,13 +9,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from taichi_edges.corridor.loading import load_scene
     from taichi_edges.corridor.pipeline import Run, run_stages
     from taichi_edges.corridor.reconstruction import Reconstruction, reconstruct
     from taichi_edges.errors import UserError
     from taichi_edges.evaluation.scoring import evaluate
     from taichi_edges.geometry.edge_set import read_edges
     from taichi_edges.geometry.wireframe import read_wireframe
-    from taichi_edges.scene.scene_file import load_scene
 
 __all__ = [
     "Reconstruction",
@@ -39,7 +39,7 @@ _HOMES = {
     "Run": "corridor.pipeline",
     "UserError": "errors",
     "evaluate": "evaluation.scoring",
-    "load_scene": "scene.scene_file",
+    "load_scene": "corridor.loading",
     "read_edges": "geometry.edge_set",
     "read_wireframe": "geometry.wireframe",
     "reconstruct": "corridor.reconstruction",

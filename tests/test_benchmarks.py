@@ -19,8 +19,8 @@ from benchmarks.scaling import slopes
 from benchmarks.view_step import PARTS, DumpedStep, part_of
 from benchmarks.wireframe import STEP_COLUMNS, STEPS, cells, measure_part, scene_path
 from benchmarks.wireframe import main as ablate
+from taichi_edges.corridor.loading import load_scene
 from taichi_edges.corridor.pipeline import Run
-from taichi_edges.scene.scene_file import load_scene
 from taichi_edges.splatting.gaussians import Gaussians
 from taichi_edges.views.cameras import project
 

@@ -12,13 +12,14 @@ from colmap_projects import LENSES, SIZE, camera, picture_of, write_model
 from told import Told
 
 from taichi_edges.corridor import evaluate, prepare, train
+from taichi_edges.corridor.loading import load_scene
 from taichi_edges.corridor.pipeline import Run, run_stages
 from taichi_edges.errors import UserError
 from taichi_edges.geometry.edge_set import read_edges
 from taichi_edges.readers.colmap import read_colmap
 from taichi_edges.readers.photogrammetry import Lens, undistorted
 from taichi_edges.readers.scene_box import scene_box
-from taichi_edges.scene.scene_file import check_scene, load_scene
+from taichi_edges.scene.scene_file import check_scene
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import look_at, ring_cameras
 from taichi_edges.synthetic.visibility import ray_scene

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
+from taichi_edges.corridor.loading import load_scene
 from taichi_edges.corridor.pipeline import Run, run_stages
-from taichi_edges.scene.scene_file import load_scene
 
 SCENE = "source: {{reader: synthetic, part: {part}, views: 16, size: 240, detector: {detector}}}\n"
 

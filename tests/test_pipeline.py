@@ -26,6 +26,7 @@ from scipy.spatial import cKDTree
 from taichi_edges.corridor.command import print_summary
 from taichi_edges.corridor.evaluate import evaluate
 from taichi_edges.corridor.findings import FINDINGS
+from taichi_edges.corridor.loading import load_scene
 from taichi_edges.corridor.pipeline import STAGES, Run, run_stages
 from taichi_edges.errors import UserError
 from taichi_edges.exporters.point_cloud import read_oriented_points
@@ -37,7 +38,7 @@ from taichi_edges.geometry.wireframe import read_wireframe
 from taichi_edges.progress import PlainProgress, TerminalProgress
 from taichi_edges.readers.points import read_points
 from taichi_edges.refinement.stage import RefineCounts
-from taichi_edges.scene.scene_file import check_scene, load_scene, parse_yaml
+from taichi_edges.scene.scene_file import check_scene, parse_yaml
 from taichi_edges.seeding.starts import given_points
 from taichi_edges.views.cameras import Similarity, invert_pose
 from taichi_edges.views.splitting import split_views

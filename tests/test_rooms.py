@@ -14,18 +14,11 @@ def rooms_of_the_picture():
     return re.findall(r"^ {8}(\w+)(?:/|\.py) ", picture, re.MULTILINE)
 
 
-class Running(ast.NodeTransformer):
-    """Leaves out what is only imported for a type checker: the name of a type is no use of its room."""
-
-    def visit_If(self, node):
-        return None if ast.unparse(node.test) == "TYPE_CHECKING" else self.generic_visit(node)
-
-
 def imports():
     """(room, module) of all that a file of a room imports from other rooms, at its top or later."""
     for path in sorted(PACKAGE.rglob("*.py")):
         room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-        for node in ast.walk(Running().visit(ast.parse(path.read_text(encoding="utf-8")))):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             names = [name.name for name in node.names] if isinstance(node, (ast.Import, ast.ImportFrom)) else []
             start = f"{node.module}." if isinstance(node, ast.ImportFrom) else ""
             modules = (f"{start}{name}" for name in names if f"{start}{name}".startswith("taichi_edges."))

@@ -5,9 +5,10 @@ from pathlib import Path
 import pytest
 import yaml
 
+from taichi_edges.corridor.loading import load_scene
 from taichi_edges.errors import UserError
 from taichi_edges.scene.presets import PRESETS, SCALES, SCALES_OF_READERS
-from taichi_edges.scene.scene_file import check_scene, load_scene
+from taichi_edges.scene.scene_file import check_scene
 from taichi_edges.scene.settings import SceneConfig
 
 SCENES = sorted((Path(__file__).parent.parent / "scenes").glob("*.yaml"))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from taichi_edges.corridor.edgels_of_views import finish_views, with_whole_paths
-from taichi_edges.corridor.sources import listed_frames, posed_frames
+from taichi_edges.corridor.sources import listed_frames, model_file, posed_frames
 from taichi_edges.errors import UserError, amount, did_you_mean
 from taichi_edges.files.artefacts import replacing
 from taichi_edges.geometry.edge_set import write_edges
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from taichi_edges.corridor.pipeline import Run
+    from taichi_edges.detectors import DetectionTask
     from taichi_edges.progress import Progress
     from taichi_edges.readers.frames import Frames
 
@@ -44,7 +45,7 @@ def prepare(run: "Run") -> dict[str, Any]:
     detector = choose_detector(source, frames)
     _refuse_needless_calibration(run, detector)
     frames = _undistorted(run, frames)
-    frames, edge_maps, edgels = DETECTORS[detector](frames, run)
+    frames, edge_maps, edgels = DETECTORS[detector](frames, _task(run, detector))
     views = _inside_the_run(run, build_views(frames, edge_maps, edgels, source, box, run.progress))
     facts = {"detector": detector, "box": np.array(box).tolist(), "box_from": box_from}
     facts |= finish_views(run, views, frames)
@@ -107,6 +108,13 @@ def _points_of(frames: "Frames | None") -> np.ndarray:
     return np.zeros((0, 3)) if frames is None or frames.points is None else frames.points
 
 
+def _task(run: "Run", detector: str) -> "DetectionTask":
+    from taichi_edges.detectors import DetectionTask
+
+    model = model_file(run) if detector == "onnx" else None
+    return DetectionTask(run.config.source, model, run.threads, run.progress)
+
+
 def _inside_the_run(run: "Run", views: Views) -> Views:
     """The views with paths relative to the run's folder for pictures in it: it may be moved."""
     folder = str(run.folder)
@@ -134,7 +142,7 @@ def _detected_in_pictures(run: "Run", views: Views) -> Views:
     paths = with_whole_paths(run, views).image_paths
     nothing = [None] * len(views)  # is known of the cameras here, nor needed
     frames = Frames(run.path("images"), views.names, [""] * len(views), paths, nothing, nothing, opengl=False)
-    _, edge_maps, edgels = DETECTORS[run.config.source.detector](frames, run)
+    _, edge_maps, edgels = DETECTORS[run.config.source.detector](frames, _task(run, run.config.source.detector))
     return replace(views, edge_maps=edge_maps, edgels=edgels)
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from taichi_edges.corridor.loading import is_source, load_scene
 from taichi_edges.corridor.pipeline import Run, run_stages, with_reader
 from taichi_edges.corridor.stages import STAGES
 from taichi_edges.errors import UserError
@@ -12,7 +13,6 @@ from taichi_edges.files.artefacts import read_facts
 from taichi_edges.geometry.wireframe import Wireframe, read_wireframe
 from taichi_edges.progress import make_progress
 from taichi_edges.scene.paths import data_folder, expand, scene_path
-from taichi_edges.scene.scene_file import is_source, load_scene
 
 
 @dataclass(frozen=True)

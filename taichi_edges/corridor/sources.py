@@ -33,7 +33,7 @@ def source_files(run: "Run") -> list[Path]:
     """Every file the prepare stage reads, so that a changed input is noticed."""
     source = run.config.source
     points = [run.data_path(source.points, "source.points")] if source.points else []
-    models = [_model_file(run)] if source.detector == "onnx" else []
+    models = [model_file(run)] if source.detector == "onnx" else []
     if source.reader == "synthetic":
         return [*points, *models]
     frames = listed_frames(run)
@@ -42,7 +42,7 @@ def source_files(run: "Run") -> list[Path]:
     return [*own, *sorted(path for path in paths if path.is_file()), *points, *models]
 
 
-def _model_file(run: "Run") -> Path:
+def model_file(run: "Run") -> Path:
     """The ONNX file the scene names."""
     path = run.data_path(run.config.source.onnx.model, "source.onnx.model")
     if not path.is_file():

@@ -1,8 +1,9 @@
 """What finds the 2D edges.
 
-DETECTORS[name](frames, run) gives the frames it could use, edge maps (V, H, W) uint8, and Edgels or None.
+DETECTORS[name](frames, task) gives the frames it could use, edge maps (V, H, W) uint8, and Edgels or None.
 """
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from taichi_edges.errors import UserError
@@ -13,10 +14,20 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from taichi_edges.corridor.pipeline import Run
+    from taichi_edges.progress import Progress
     from taichi_edges.readers.frames import Frames
     from taichi_edges.scene.settings import SourceConfig
     from taichi_edges.views.edgels import Edgels
+
+
+@dataclass(frozen=True)
+class DetectionTask:
+    """What detectors need besides the frames. source: the section of the scene. model: its ONNX file, None without."""
+
+    source: "SourceConfig"
+    model: "Path | None"
+    threads: int
+    progress: "Progress"
 
 
 def choose_detector(source: "SourceConfig", frames: "Frames") -> str:
@@ -26,14 +37,14 @@ def choose_detector(source: "SourceConfig", frames: "Frames") -> str:
     return "maps" if source.edges or not any(frames.image_paths) else "subpixel"
 
 
-def read_maps(frames: "Frames", run: "Run") -> "tuple[Frames, np.ndarray, Edgels | None]":
+def read_maps(frames: "Frames", task: "DetectionTask") -> "tuple[Frames, np.ndarray, Edgels | None]":
     """Ready edge maps. They may be biased, and have no edgels yet."""
     from taichi_edges.readers.images import read_edge_maps
 
-    return frames, read_edge_maps(frames, run.progress, run.threads), None
+    return frames, read_edge_maps(frames, task.progress, task.threads), None
 
 
-def detect_subpixel(frames: "Frames", run: "Run") -> "tuple[Frames, np.ndarray, Edgels | None]":
+def detect_subpixel(frames: "Frames", task: "DetectionTask") -> "tuple[Frames, np.ndarray, Edgels | None]":
     """Edgels by our own detector, and maps drawn through them."""
     import numpy as np
 
@@ -41,30 +52,30 @@ def detect_subpixel(frames: "Frames", run: "Run") -> "tuple[Frames, np.ndarray, 
     from taichi_edges.readers.images import check_sizes, frames_with_images, name_edgeless
     from taichi_edges.views.drawing import draw_edge_maps
 
-    frames = frames_with_images(frames, run.progress)
-    with run.progress.track("detect", len(frames.names)) as report:
-        edgels, found = trace_pictures(frames.image_paths, run.threads, report, run.config.source.gamma or None)
+    frames = frames_with_images(frames, task.progress)
+    with task.progress.track("detect", len(frames.names)) as report:
+        edgels, found = trace_pictures(frames.image_paths, task.threads, report, task.source.gamma or None)
     sizes = [size for size in found if size is not None]  # all of them: every frame has an image
     check_sizes(frames, sizes, "colour image")
     if len(edgels) == 0:
         problem = f"no edge found in any of {len(frames.names)} images"
         raise UserError(f"{frames.where}: {problem}; are they black, blank or out of focus? Check source.images")
-    name_edgeless(frames.names, np.diff(edgels.starts), run.progress)
+    name_edgeless(frames.names, np.diff(edgels.starts), task.progress)
     width, height = sizes[0]
-    return frames, draw_edge_maps(edgels, height, width, run.threads), edgels
+    return frames, draw_edge_maps(edgels, height, width, task.threads), edgels
 
 
-def detect_onnx(frames: "Frames", run: "Run") -> "tuple[Frames, np.ndarray, Edgels | None]":
+def detect_onnx(frames: "Frames", task: "DetectionTask") -> "tuple[Frames, np.ndarray, Edgels | None]":
     """Edge maps by a learned detector, biased as such detectors are."""
     import numpy as np
 
     from taichi_edges.detectors.onnx import detect_maps
     from taichi_edges.readers.images import check_sizes, frames_with_images
 
-    frames, onnx = frames_with_images(frames, run.progress), run.config.source.onnx
-    model = run.data_path(onnx.model, "source.onnx.model")
+    frames, onnx = frames_with_images(frames, task.progress), task.source.onnx
+    assert task.model is not None
     images = ComposedImages(frames.image_paths)
-    maps = detect_maps(images, model, onnx.network or None, onnx.scale, onnx.flip, run.threads, run.progress)
+    maps = detect_maps(images, task.model, onnx.network or None, onnx.scale, onnx.flip, task.threads, task.progress)
     check_sizes(frames, [(edge_map.shape[1], edge_map.shape[0]) for edge_map in maps], "colour image")
     return frames, np.stack(maps), None
 
