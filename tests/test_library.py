@@ -260,7 +260,7 @@ def test_what_is_installed_holds_every_file_and_the_scenes(elsewhere):
     assert {f"taichi_edges/scenes/{name}.yaml" for name in shipped_scenes()} <= installed
     code = "from taichi_edges import load_scene; print(load_scene('demo').source.part, load_scene.__code__.co_filename)"
     done = python("-c", code, cwd=elsewhere, PYTHONPATH=str(place))
-    assert done.stdout == f"demo {place / 'taichi_edges/scene/scene_file.py'}\n", done.stderr
+    assert done.stdout == f"demo {place / 'taichi_edges/corridor/loading.py'}\n", done.stderr
 
 
 def test_a_path_that_the_encoding_of_the_output_lacks_is_printed_all_the_same(elsewhere):
