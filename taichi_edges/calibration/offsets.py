@@ -92,7 +92,7 @@ def fit_offsets(observations, known, count=None):
     residuals = observations.offsets - np.median(observations.offsets)
     robust = _weights(residuals, redescending=False)
     for round_ in range(1, ABSOLUTE_ROUNDS + REDESCENDING_ROUNDS + 1):
-        values, displacements, matrix = _solve(observations, weights * robust, known, count)
+        values, displacements, matrix = solve_offsets(observations, weights * robust, known, count)
         residuals = _residuals(observations, values, displacements)
         robust = _weights(residuals, redescending=round_ >= ABSOLUTE_ROUNDS)
     return Fit(values, displacements, residuals, weights * robust, robust, matrix)
@@ -159,7 +159,7 @@ def _residuals(observations, values, displacements):
     return residuals - (observations.slopes * displacements[observations.owners]).sum(axis=1)
 
 
-def _solve(observations, weights, known, count):
+def solve_offsets(observations, weights, known, count):
     """Weighted least squares: values (3,), displacements (count, 2), and the matrix of the values' normal equations.
 
     The points are eliminated first, each by itself (Schur complement).
@@ -202,7 +202,7 @@ def _jackknife(observations, weights, known, count, groups):
     labels = np.unique(groups)
     if len(labels) < 2:
         return np.full(3, NOTHING_KNOWN**2)
-    found = np.array([_solve(observations, weights * (groups != label), known, count)[0] for label in labels])
+    found = np.array([solve_offsets(observations, weights * (groups != label), known, count)[0] for label in labels])
     return (len(labels) - 1) * found.var(axis=0)
 
 

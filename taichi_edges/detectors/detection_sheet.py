@@ -74,11 +74,11 @@ def write_detection_sheet(path, views, residuals=None, on_silhouette=None, pictu
     assert on_silhouette is None or len(on_silhouette) == len(views.edgels)
     silhouette = None if on_silhouette is None else np.asarray(on_silhouette) >= 0.5
     residuals = None if residuals is None else np.asarray(residuals, dtype=np.float64)
-    limit, cell = _limit(residuals), _cell_size(views)
+    limit, cell = colour_limit(residuals), _cell_size(views)
     chosen = choose_views(views, count)
     rows = [_header(views, len(chosen), residuals, silhouette, limit, cell)]
     for view in chosen:
-        content = _content(views, view, residuals, silhouette, limit, cell, picture_reader or _read_picture)
+        content = content_of(views, view, residuals, silhouette, limit, cell, picture_reader or _read_picture)
         rows += [_row_title(views, view, content, cell), _row([draw(content, cell) for draw in _columns(residuals)])]
     written, encoded = cv2.imencode(".png", np.concatenate(rows)[:, :, ::-1])
     assert written
@@ -118,7 +118,7 @@ def _read_picture(path):
     return None if picture is None else picture[:, :, ::-1]
 
 
-def _limit(residuals):
+def colour_limit(residuals):
     """px; the end of the colour bar: a round number that holds most of the residuals."""
     known = np.abs(residuals[np.isfinite(residuals)]) if residuals is not None else np.zeros(0)
     wanted = np.percentile(known, COVERED) if len(known) else LIMITS[0]
@@ -130,11 +130,11 @@ def _cell_size(views):
     return CELL_WIDTH, int(np.clip(round(CELL_WIDTH * views.height / views.width), *CELL_HEIGHTS))
 
 
-def _content(views, view, residuals, silhouette, limit, cell, picture_reader):
+def content_of(views, view, residuals, silhouette, limit, cell, picture_reader):
     part = slice(views.edgels.starts[view], views.edgels.starts[view + 1])
     points, normals, strengths = views.edgels.of_view(view)
     of_view = [None if values is None else values[part] for values in (residuals, silhouette)]
-    window = _busiest(points, *of_view, (views.width, views.height), cell)
+    window = busiest_window(points, *of_view, (views.width, views.height), cell)
     photo = _photo(views, view, picture_reader)
     picture = cv2.cvtColor(255 - views.edge_maps[view], cv2.COLOR_GRAY2RGB) if photo is None else photo
     shown = picture, photo is not None, views.edge_maps[view]
@@ -152,7 +152,7 @@ def _photo(views, view, picture_reader):
     return cv2.resize(picture, (views.width, views.height), interpolation=cv2.INTER_AREA)
 
 
-def _busiest(points, residuals, silhouette, size, cell):
+def busiest_window(points, residuals, silhouette, size, cell):
     """Left, top, width, height, px, of the part to magnify: where most edgels are, of both kinds where they are known.
 
     Edgels without a residual do not count where others have one. Without any, the middle of the view.
@@ -164,13 +164,13 @@ def _busiest(points, residuals, silhouette, size, cell):
     if not len(points):
         return (size[0] - width) // 2, (size[1] - height) // 2, width, height
     kinds = [counted] if silhouette is None else [counted & silhouette, counted & ~silhouette]
-    sums = [_window_sums(points[kind], size, (width, height)) for kind in kinds]
+    sums = [window_sums(points[kind], size, (width, height)) for kind in kinds]
     score = sum(sums) + MIXED * np.minimum.reduce(sums)
     top, left = np.unravel_index(np.argmax(score), score.shape)
     return int(left), int(top), width, height
 
 
-def _window_sums(points, size, window):
+def window_sums(points, size, window):
     """How many points lie in each place of a window in an image; both sizes are (width, height) px."""
     columns, rows = (
         np.clip(np.rint(values), 0, side - 1).astype(int) for values, side in zip(points.T, size, strict=True)
@@ -187,7 +187,7 @@ def _window_sums(points, size, window):
 def _columns(residuals):
     """The cells of a row, from left to right: functions (content, cell) -> (h, w, 3) uint8."""
     return [_whole_picture, _whole_map, _whole_edgels, _magnified_edgels] + (
-        [_magnified_residuals, _histograms] if residuals is not None else []
+        [magnified_residuals, _histograms] if residuals is not None else []
     )
 
 
@@ -217,7 +217,7 @@ def _magnified_edgels(content, cell):
     return _magnified(content, cell, strength_colours(content.strengths))
 
 
-def _magnified_residuals(content, cell):
+def magnified_residuals(content, cell):
     return _magnified(content, cell, residual_colours(content.residuals, content.limit))
 
 
@@ -313,7 +313,7 @@ HEADINGS = {
     _whole_map: ("edge map", "what the splatting learns from"),
     _whole_edgels: ("edgels", "framed: the part that is magnified"),
     _magnified_edgels: ("edgels, magnified", None),
-    _magnified_residuals: ("residuals, magnified", None),
+    magnified_residuals: ("residuals, magnified", None),
     _histograms: ("residuals", "outwards positive; red: median"),
 }
 
@@ -333,7 +333,7 @@ def _header(views, shown, residuals, silhouette, limit, cell):
         _write(picture, heading, (left, 4 * LINE - 4), bold=True)
         if column is _magnified_edgels:
             _bar(picture, (left, 4 * LINE + 4), strength_colours, (0.0, 0.5, 1.0), "{:g}", "strength", cell)
-        elif column is _magnified_residuals:
+        elif column is magnified_residuals:
             ticks = (-limit, 0.0, limit)
             _bar(picture, (left, 4 * LINE + 4), lambda r: residual_colours(r, limit), ticks, "{:+g}", "px", cell)
         else:
@@ -374,7 +374,7 @@ def _row_title(views, view, content, cell):
     name = _shortened(views.names[view], cell[0] - _text_width(what, bold=True)) + what
     words = {_whole_picture: name, _whole_edgels: count, _magnified_edgels: magnified}
     if content.residuals is not None:
-        words[_magnified_residuals] = f"{np.isfinite(content.residuals).sum()} with a residual"
+        words[magnified_residuals] = f"{np.isfinite(content.residuals).sum()} with a residual"
     for place, column in enumerate(columns):
         left, bold = GAP + place * (cell[0] + GAP), column is _whole_picture
         _write(picture, words.get(column, ""), (left, LINE), bold=bold, room=cell[0])

@@ -15,7 +15,7 @@ CLAIM = 0.8  # a point claims the pixels within this many line widths of its pro
 SAME_EDGE = 2.5  # a pixel supports the points within this many line widths (in 3D) of its owner
 WIDTH_VIEWS = 64  # the width of the lines is measured in so many views at most
 
-_widths = {}  # (id of Views, threshold): line width in pixels; an entry goes with its Views
+known_widths = {}  # (id of Views, threshold): line width in pixels; an entry goes with its Views
 
 
 def edge_strength(views, points):
@@ -38,10 +38,10 @@ def line_width(views, threshold):
     threshold: of full scale. Measured once for each Views.
     """
     key = (id(views), threshold)
-    if key not in _widths:
-        _widths[key] = _measure_width(views.edge_maps[:: -(-len(views) // WIDTH_VIEWS)], threshold)
-        weakref.finalize(views, _widths.pop, key, None)
-    return _widths[key], _widths[key] * pixel_size(views)
+    if key not in known_widths:
+        known_widths[key] = _measure_width(views.edge_maps[:: -(-len(views) // WIDTH_VIEWS)], threshold)
+        weakref.finalize(views, known_widths.pop, key, None)
+    return known_widths[key], known_widths[key] * pixel_size(views)
 
 
 def _measure_width(edge_maps, threshold):

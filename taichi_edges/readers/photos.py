@@ -92,7 +92,7 @@ def _solved(images, names, masks, cache, seed, threads, progress):
 
     registered, unreadable: names of photographs. files: {name: digest} of the model's.
     """
-    groups = _by_camera(images, names, threads)
+    groups = by_camera(images, names, threads)
     grouped = {name for group in groups for name in group}
     readable = [name for name in names if name in grouped]
     _refuse_few(images, readable)
@@ -153,7 +153,7 @@ def _digests(folder):
     return {path.name: digest_file(path) for path in model_files(folder)}
 
 
-def _by_camera(images, names, threads):
+def by_camera(images, names, threads):
     """Lists of names that share a camera: of one folder, one size, one focal length; without what is no image."""
 
     def kind(name):
