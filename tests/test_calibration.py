@@ -12,8 +12,14 @@ from taichi_edges.calibration import consensus as consensus_module
 from taichi_edges.calibration.backgrounds import flooded, image_steps, look_beside, sample, smooth_step
 from taichi_edges.calibration.calibration import calibrate, sides_of
 from taichi_edges.calibration.consensus import Consensus, across, edgel_table
-from taichi_edges.calibration.offsets import Observations, camera_leverage, fit_offsets, neighbourhoods, standard_errors
-from taichi_edges.calibration.offsets import _solve as solve
+from taichi_edges.calibration.offsets import (
+    Observations,
+    camera_leverage,
+    fit_offsets,
+    neighbourhoods,
+    solve_offsets,
+    standard_errors,
+)
 from taichi_edges.detectors.ridges import single_width, trace_ridges
 from taichi_edges.synthetic.drawing import Imperfections, draw_edge_map
 from taichi_edges.synthetic.parts import PARTS
@@ -274,7 +280,7 @@ def test_silhouettes_of_views_whose_background_leaked_do_not_count(part, generat
     inside = (observations.views < leaked) & (observations.silhouette > 0)
     observations.offsets[inside] -= OFFSET
     observations = observations.keep(observations.views < VIEWS)
-    kept = consensus._without_odd_views(observations, UNKNOWN)
+    kept = consensus.without_odd_views(observations, UNKNOWN)
     np.testing.assert_array_equal(np.unique(kept.views[kept.silhouette > 0]), np.arange(leaked, VIEWS))
     assert (kept.silhouette == 0).sum() == (observations.silhouette == 0).sum()
     np.testing.assert_allclose(fit_offsets(kept, UNKNOWN, len(consensus.points)).values, values, atol=0.03)
@@ -337,7 +343,7 @@ def test_leverage_of_the_cameras_is_what_moving_views_does(generator):
     found = []
     for view, axis in np.ndindex(20, 2):
         moved = np.where(observations.views == view, 1e-4 * observations.normals[:, axis], 0.0)
-        again = solve(replace(observations, offsets=moved), fit.weights, UNKNOWN, 30)[0]
+        again = solve_offsets(replace(observations, offsets=moved), fit.weights, UNKNOWN, 30)[0]
         found.append(again / 1e-4)
     expected = np.linalg.norm(found, axis=0)
     np.testing.assert_allclose(camera_leverage(observations, fit, UNKNOWN, 30), expected, rtol=1e-6)

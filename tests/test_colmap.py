@@ -359,6 +359,6 @@ def test_maps_for_a_scan_go_the_way_of_the_images_that_prepare_has_kept(project,
     size = undistorted(Lens("OPENCV", *SIZE, LENSES["OPENCV"]))[1]
     names = [f"{view:04d}" for view in range(VIEWS - 1)]
     views = SimpleNamespace(names=names[1:], edge_maps=np.zeros((1, *size[::-1]), np.uint8))
-    maps = evaluate._scan_maps(run, views, SimpleNamespace(names=names[:1]))
+    maps = evaluate.scan_maps(run, views, SimpleNamespace(names=names[:1]))
     assert set(maps) == set(names) and all(each.shape == size[::-1] and each.max() > 200 for each in maps.values())
     assert not (run.path("undistorted_for_scan") / "images").exists()

@@ -144,8 +144,8 @@ def test_a_planted_residual_is_drawn_in_its_colour_at_its_place(generator, sign,
     point = np.array([[70.25, 61.6]])
     views = replace(views, edgels=Edgels.of_views([(point, np.array([[1.0, 0.0]]), np.array([1.0]))]))
     cell = (400, 300)
-    content = sheet._content(views, 0, np.array([sign * 3.0]), None, 1.0, cell, None)
-    drawn = sheet._magnified_residuals(content, cell)
+    content = sheet.content_of(views, 0, np.array([sign * 3.0]), None, 1.0, cell, None)
+    drawn = sheet.magnified_residuals(content, cell)
     assert has_colour(drawn, colour) and not has_colour(drawn, other)
     rows, columns = np.nonzero((drawn == colour).all(axis=2))
     left, top, width, _ = content.window
@@ -166,8 +166,8 @@ def test_residuals_on_the_sheet_have_both_colours_only_where_there_are_both(tmp_
 
 def test_edgels_without_a_residual_are_grey(generator):
     views, cell = make_views(generator, 1), (400, 300)
-    content = sheet._content(views, 0, np.full(len(views.edgels), np.nan), None, 1.0, cell, None)
-    drawn = sheet._magnified_residuals(replace(content, picture=np.zeros((120, 160, 3), np.uint8)), cell)
+    content = sheet.content_of(views, 0, np.full(len(views.edgels), np.nan), None, 1.0, cell, None)
+    drawn = sheet.magnified_residuals(replace(content, picture=np.zeros((120, 160, 3), np.uint8)), cell)
     assert has_colour(drawn, UNKNOWN) and not has_colour(drawn, POSITIVE) and not has_colour(drawn, NEGATIVE)
 
 
@@ -182,16 +182,20 @@ def test_median_and_mad_leave_out_what_is_unknown():
 
 
 def test_the_colour_bar_ends_at_a_round_number_that_holds_most():
-    assert sheet._limit(np.array([0.3, -0.4, np.nan])) == 0.5
-    assert sheet._limit(np.r_[np.full(99, 0.05), 8.0]) == 0.1
-    assert sheet._limit(np.array([500.0])) == 10.0 and sheet._limit(np.zeros(0)) == 0.1 and sheet._limit(None) == 0.1
+    assert sheet.colour_limit(np.array([0.3, -0.4, np.nan])) == 0.5
+    assert sheet.colour_limit(np.r_[np.full(99, 0.05), 8.0]) == 0.1
+    assert (
+        sheet.colour_limit(np.array([500.0])) == 10.0
+        and sheet.colour_limit(np.zeros(0)) == 0.1
+        and sheet.colour_limit(None) == 0.1
+    )
 
 
 def test_the_part_with_most_edgels_is_magnified(generator):
     size, cell = (800, 600), (400, 300)
     crowd = generator.uniform((500, 300), (570, 350), (300, 2))
     points = np.concatenate([crowd, generator.uniform(0, (799, 599), (100, 2)), [[-3.0, 700.0]]])
-    left, top, width, height = sheet._busiest(points, None, None, size, cell)
+    left, top, width, height = sheet.busiest_window(points, None, None, size, cell)
     assert (width, height) == (80, 60)
     inside = ((crowd >= (left - 0.5, top - 0.5)) & (crowd < (left + width - 0.5, top + height - 0.5))).all(axis=1)
     assert inside.mean() > 0.95
@@ -201,16 +205,16 @@ def test_the_magnified_part_shows_both_kinds_and_known_residuals(generator):
     size, cell = (800, 600), (400, 300)
     crowd, mixed = generator.uniform(100, 140, (400, 2)), generator.uniform(400, 440, (200, 2))
     points, silhouette = np.concatenate([crowd, mixed]), np.r_[np.ones(400, bool), np.arange(200) % 2 == 0]
-    left, _, width, _ = sheet._busiest(points, None, silhouette, size, cell)
+    left, _, width, _ = sheet.busiest_window(points, None, silhouette, size, cell)
     assert left + width > 400  # 400 of one kind lose against 100 of each
     residuals = np.r_[np.full(400, np.nan), np.ones(200)]
-    left, _, width, _ = sheet._busiest(points, residuals, None, size, cell)
+    left, _, width, _ = sheet.busiest_window(points, residuals, None, size, cell)
     assert left + width > 400
 
 
 def test_window_sums_count_points(generator):
     points = generator.uniform(0, (12, 9), (60, 2))
-    sums = sheet._window_sums(points, (13, 10), (4, 3))
+    sums = sheet.window_sums(points, (13, 10), (4, 3))
     assert sums.shape == (8, 10)
     columns, rows = np.rint(points).astype(int).T
     for top, left in ((0, 0), (7, 9), (3, 5)):

@@ -20,7 +20,7 @@ from taichi_edges.scene.settings import ClusterConfig, FilterConfig, FitConfig
 from taichi_edges.strokes.cluster_fits import fit_cluster, fit_curve, fit_line, wireframe_of
 from taichi_edges.strokes.clustering import DIRECTION_MEMORY, grow_clusters, seed_order
 from taichi_edges.strokes.neighbors import UNASSIGNED, alignment, members_of_clusters, neighbor_graph
-from taichi_edges.strokes.ordering import _bridge, connected_graph, order_points
+from taichi_edges.strokes.ordering import connected_graph, join_pieces, order_points
 from taichi_edges.views.views import Views
 
 CENTRE = np.full(3, 0.5)
@@ -267,7 +267,7 @@ def test_pieces_of_a_graph_are_joined_by_their_shortest_connections(generator):
         a, b = np.unravel_index(gaps.argmin(), gaps.shape)
         expected[min(a, b), max(a, b)] = distances[a, b]
         inside |= labels == labels[b]
-    bridged = _bridge(points, coo_array((108, 108)).tocsr(), labels).tocoo()
+    bridged = join_pieces(points, coo_array((108, 108)).tocsr(), labels).tocoo()
     found = {(a, b): value for a, b, value in zip(*bridged.coords, bridged.data) if a < b}
     assert bridged.nnz == 2 * len(found) and found.keys() == expected.keys()
     np.testing.assert_allclose([found[pair] for pair in expected], list(expected.values()))

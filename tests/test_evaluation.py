@@ -108,9 +108,9 @@ def test_sampling_follows_emap():
     np.testing.assert_allclose(sample_prediction(EdgeSet.of(curves=[curve])), expected, atol=1e-6)
 
 
-def test_voxel_average_agrees_with_a_loop():
+def test_voxel_average_agrees_with_a_loop(generator):
     """The slow twin, points outside [-1, 1]^3 included: the grid goes on there."""
-    points = np.random.default_rng().uniform(-1.3, 1.3, (3000, 3)).astype(np.float32)
+    points = generator.uniform(-1.3, 1.3, (3000, 3)).astype(np.float32)
     points[:1500] = points[0] + 0.02 * points[:1500]  # many to a voxel
     bins = {}
     for point in points:
@@ -244,13 +244,12 @@ def test_a_circle_found_twice_is_half_duplicate_though_cut_differently():
     assert duplicates_of(alike) == pytest.approx(50.0, abs=1.0)
 
 
-def test_duplicates_of_lines_agree_with_a_loop():
+def test_duplicates_of_lines_agree_with_a_loop(generator):
     """The slow twin: every line in turn, longest first, against the feet of the perpendiculars on those before it."""
-    rng = np.random.default_rng()
-    starts = np.zeros((25, 3)) + [0.0, 0.004, 0.0] * rng.integers(0, 5, (25, 1))
-    starts[:, 0] += rng.uniform(0, 1, 25)
-    lines = np.stack([starts, starts + [1.0, 0, 0] * rng.uniform(0.1, 0.6, (25, 1))], axis=1)
-    lines[:, 1, 1] += rng.uniform(-0.005, 0.005, 25)
+    starts = np.zeros((25, 3)) + [0.0, 0.004, 0.0] * generator.integers(0, 5, (25, 1))
+    starts[:, 0] += generator.uniform(0, 1, 25)
+    lines = np.stack([starts, starts + [1.0, 0, 0] * generator.uniform(0.1, 0.6, (25, 1))], axis=1)
+    lines[:, 1, 1] += generator.uniform(-0.005, 0.005, 25)
     lengths = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
     counted, repeated = [], 0
     for number in np.argsort(-lengths):

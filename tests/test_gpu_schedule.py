@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from gradient_checks import assert_gradients, gradients, random_neighbors
 from paper_training import paper_training
 from reference_splatting import (
     INSIDE,
@@ -26,7 +27,6 @@ from reference_splatting import (
     transmittance,
 )
 from scipy.spatial import cKDTree
-from test_gradients import assert_gradients, gradients, random_neighbors
 
 from taichi_edges.progress import Progress
 from taichi_edges.splatting.gaussians import start_gaussians

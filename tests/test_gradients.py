@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from autodiff_splatting import AutodiffSplat
+from gradient_checks import assert_gradients, gradients, random_neighbors
 from reference_splatting import (
     INSIDE,
     NO_EDGES,
@@ -26,33 +27,13 @@ from reference_splatting import (
 
 from taichi_edges.splatting.gaussians import Gaussians
 
-WIDTH, HEIGHT, NEIGHBORS = 50, 40, 4
+WIDTH, HEIGHT = 50, 40
 VIEWS = (OUTSIDE, OBLIQUE, INSIDE)
 
 # Of a group's largest derivative. The twin's derivatives are exact (complex steps), so only rounding is left: 1e-16 in
 # f64 and 6e-8 in f32, times up to 1e3 for the determinant of a needle (see test_splatting.py), times 1e3 for
 # 1 / (1 - a) at a = 0.999 in f64; in f32 the Gaussians have no such alphas.
 TOLERANCE = {"f64": 1e-9, "f32": 2e-4}
-
-
-def gradients(splatter):
-    """The gradients on the device, as Gaussians."""
-    fields = splatter.fields
-    return Gaussians(*(getattr(fields, name).grad.to_numpy()[: fields.count] for name in PARAMETERS))
-
-
-def assert_gradients(actual, expected, tolerance):
-    for name in PARAMETERS:
-        scale = np.abs(getattr(expected, name)).max(initial=0)
-        np.testing.assert_allclose(
-            getattr(actual, name), getattr(expected, name), rtol=0, atol=tolerance * scale, err_msg=name
-        )
-
-
-def random_neighbors(count, generator):
-    """(n, NEIGHBORS) indices of others, some of them neighbours of many, some of none."""
-    popular = generator.integers(0, max(count // 3, 1), (count, NEIGHBORS))
-    return np.where(popular == np.arange(count)[:, None], (popular + 1) % count, popular)
 
 
 # The image loss -------------------------------------------------------------------------------------------------------

@@ -313,8 +313,8 @@ def test_edges_that_fit_no_better_than_chance_are_told_from_those_that_fit(brack
     exchanged = Edgels.of_views([edgels.of_view((view + 1) % len(held_out)) for view in range(len(held_out))])
     told = Warnings()
     for one in (held_out, replace(held_out, edgels=exchanged)):
-        evaluate._warn_of_chance(held_out_metrics(exact_polylines(part.edges), views, one), told)
+        evaluate.warn_of_chance(held_out_metrics(exact_polylines(part.edges), views, one), told)
     (text,) = told.texts
     assert "of the edges fit the held-out views, where chance alone gives" in text and "their order" in text
-    evaluate._warn_of_chance(held_out_metrics(exact_polylines(part.edges), views, split_views(views, [])[1]), told)
+    evaluate.warn_of_chance(held_out_metrics(exact_polylines(part.edges), views, split_views(views, [])[1]), told)
     assert told.texts == [text]  # nothing is known without held-out views

@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from colmap_projects import camera, picture_of_polygon, write_model
-from test_onnx import grey_kernel, node, write_network
-from test_prepare import SIDES
+from onnx_networks import write_sides
 
 from taichi_edges.corridor import prepare
 from taichi_edges.corridor.pipeline import Run
@@ -105,13 +104,6 @@ def test_a_view_that_is_masked_out_is_named(tmp_path):
     assert told.texts == ["1 of 2 masks leave no edge: view1"]
 
 
-def write_sides_network(path):
-    """Vertical edges that are bright on the right, as test_prepare has them."""
-    sides = node("Conv", ["image", "kernel", "bias"], "map", kernel_shape=[3, 3], pads=[1] * 4)
-    weights = {"kernel": grey_kernel(SIDES)[None], "bias": np.array([-6.0], np.float32)}
-    write_network(path, [sides], weights)
-
-
 @pytest.fixture
 def project(tmp_path):
     """Two rectangles through a lens with distortion; masks that keep the left one; maps of both."""
@@ -146,7 +138,7 @@ def project(tmp_path):
     ids=["subpixel", "maps", "maps as they are", "onnx"],
 )
 def test_every_detector_heeds_the_masks(project, tmp_path, source):
-    write_sides_network(tmp_path / "dexined_sides.onnx")
+    write_sides(tmp_path / "dexined_sides.onnx")
     (tmp_path / "run").mkdir()
     config = check_scene(
         {

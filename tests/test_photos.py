@@ -205,7 +205,7 @@ def test_cameras_are_shared_within_a_folder_by_photographs_of_one_size(tmp_path)
     for name, shape in (("a/1.png", (9, 12)), ("a/2.png", (9, 12)), ("a/3.png", (12, 9)), ("b/4.png", (9, 12))):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(tmp_path / name), np.zeros(shape, np.uint8))
-    groups = photos._by_camera(tmp_path, ["a/1.png", "a/2.png", "a/3.png", "b/4.png"], 1)
+    groups = photos.by_camera(tmp_path, ["a/1.png", "a/2.png", "a/3.png", "b/4.png"], 1)
     assert groups == [["a/1.png", "a/2.png"], ["a/3.png"], ["b/4.png"]]
 
 
@@ -275,7 +275,7 @@ def test_maps_for_a_scan_are_found_where_photographs_have_no_poses(album, solved
     names = frames.names[1:]  # prepare has left one out
     size = photogrammetry.undistorted(frames.lenses[0])[1]
     views = SimpleNamespace(names=names[:-1], edge_maps=np.zeros((1, *size[::-1]), np.uint8))
-    maps = evaluate._scan_maps(run, views, SimpleNamespace(names=names[-1:]))
+    maps = evaluate.scan_maps(run, views, SimpleNamespace(names=names[-1:]))
     assert list(maps) == names and all(found.shape == size[::-1] and found.max() > 100 for found in maps.values())
     made = run.path("undistorted_for_scan")
     assert len(list(made.glob("edges/*.png"))) == len(names) and not (made / "images").exists()

@@ -429,9 +429,9 @@ def test_another_version_of_a_package_makes_those_stages_stale_that_use_it(copie
     from taichi_edges.corridor import pipeline
 
     monkeypatch.setattr(pipeline, "version", lambda name: "99.0" if name == "ezdxf" else version(name))
-    pipeline._versions.cache_clear()
+    pipeline.package_versions.cache_clear()
     record, said = rerun(copied)
-    pipeline._versions.cache_clear()
+    pipeline.package_versions.cache_clear()
     assert record["ran"] == ["export"] and record["versions"]["ezdxf"] == "99.0"
     assert any("export again" in line and "the version of ezdxf was" in line for line in said.lines)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from test_onnx import grey_kernel, node, write_network
+from onnx_networks import write_sides
 
 from taichi_edges.corridor import prepare as stage
 from taichi_edges.corridor.pipeline import Run
@@ -21,7 +21,6 @@ from taichi_edges.views.cameras import invert_pose
 from taichi_edges.views.views import read_views
 
 VIEWS, SIZE = 6, 160
-SIDES = np.array([[-1.0, 0, 1], [-2, 0, 2], [-1, 0, 1]]) / 20  # logits from grey levels: vertical edges
 
 
 class Warnings(Progress):
@@ -183,9 +182,7 @@ def test_mistakes_in_the_calibration_are_named(calibration, words):
 
 
 def test_a_network_from_a_file(prepare, tmp_path):
-    sides = node("Conv", ["image", "kernel", "bias"], "map", kernel_shape=[3, 3], pads=[1] * 4)
-    weights = {"kernel": grey_kernel(SIDES)[None], "bias": np.array([-6.0], np.float32)}
-    onnx = {"model": str(write_network(tmp_path / "dexined_sides.onnx", [sides], weights))}
+    onnx = {"model": str(write_sides(tmp_path / "dexined_sides.onnx"))}
     facts, views, _ = prepare({"detector": "onnx", "onnx": onnx}, calibration="off")
     assert facts["detector"] == "onnx" and facts["edgels"] > 0
     assert (np.abs(views.edgels.normals[:, 0]) > 0.5).mean() > 0.6  # vertical edges

@@ -2,6 +2,7 @@
 
 import gc
 
+import cv2
 import numpy as np
 import pytest
 import reference_support as reference
@@ -93,16 +94,16 @@ def test_a_map_without_background_does_not_count_for_the_width_of_the_lines():
 
 
 def test_the_width_of_the_lines_is_measured_once(monkeypatch):
-    views, measured = scene(A), []
-    monkeypatch.setattr(support, "_measure_width", lambda *arguments: measured.append(arguments) or 2.0)
-    assert line_width(views, 0.5) == line_width(views, 0.5) and len(measured) == 1
+    views, measured, transform = scene(A), [], cv2.distanceTransform
+    monkeypatch.setattr(cv2, "distanceTransform", lambda *arguments: measured.append(1) or transform(*arguments))
+    assert line_width(views, 0.5) == line_width(views, 0.5) and len(measured) == len(views)
     line_width(views, 0.25)
     line_width(scene(A), 0.5)
-    assert len(measured) == 3
-    known = set(support._widths)
+    assert len(measured) == 3 * len(views)
+    known = set(support.known_widths)
     del views
     gc.collect()
-    assert len(support._widths) < len(known)  # it is forgotten with the views
+    assert len(support.known_widths) < len(known)  # it is forgotten with the views
 
 
 # ------------------------------------------------------------------------------------------- against the slow twins

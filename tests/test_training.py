@@ -231,7 +231,7 @@ def test_flanks_spare_established_edges_but_no_strays(
     given, take_in = [], training.splatter.take_in_flanks
     monkeypatch.setattr(training.splatter, "take_in_flanks", lambda points: (given.append(points), take_in(points)))
     training.run(start_gaussians(np.concatenate([on, off]), generator, 0.01, 0.5), Progress())
-    assert sorted(step for step, actions in training.actions.items() if training._take_in_flanks in actions) == [12, 18]
+    assert sorted(step for step, actions in training.actions.items() if training.take_in_flanks in actions) == [12, 18]
     for points in given:
         strays = (cKDTree(edges).query(points)[0] > 4 * PIXEL).sum() if len(points) else 0
         assert len(points) == 0 if share_of_strays is None else len(points) > 0.5 * len(on)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from edgel_scenes import SIZE, blank_views, line, views_of
 
-from taichi_edges.readers.frames import _pixel_at
+from taichi_edges.readers.frames import pixel_at
 from taichi_edges.synthetic.rendering import look_at
 from taichi_edges.views.cameras import Similarity
 from taichi_edges.views.views import pixel_size, read_views, write_views
@@ -47,8 +47,8 @@ def test_pixel_at_points_is_the_median_of_what_each_view_sees():
     depths = np.array([1.0, 2.0, 3.0, 4.0])
     walls = [middle + depth * forward + shift for depth, forward in zip(depths, ahead) for shift in np.eye(3) * 0.01]
     points = np.array([*walls, middle + 100 * ahead[0]])
-    assert _pixel_at(points, intrinsics, poses, (SIZE, SIZE)) == pytest.approx(2.5 / 400, rel=0.01)
-    assert _pixel_at(points, intrinsics[:1], poses[:1], (SIZE, SIZE)) == pytest.approx(1.0 / 400, rel=0.01)
+    assert pixel_at(points, intrinsics, poses, (SIZE, SIZE)) == pytest.approx(2.5 / 400, rel=0.01)
+    assert pixel_at(points, intrinsics[:1], poses[:1], (SIZE, SIZE)) == pytest.approx(1.0 / 400, rel=0.01)
     behind = middle - ahead[:1]
-    assert _pixel_at(behind, intrinsics[:1], poses[:1], (SIZE, SIZE)) is None
-    assert _pixel_at(np.zeros((0, 3)), intrinsics, poses, (SIZE, SIZE)) is None
+    assert pixel_at(behind, intrinsics[:1], poses[:1], (SIZE, SIZE)) is None
+    assert pixel_at(np.zeros((0, 3)), intrinsics, poses, (SIZE, SIZE)) is None

@@ -88,7 +88,7 @@ class Consensus:
             values = fit.values
         observations = self._balanced(self._well_seen(self.observe(values, REACHES[-1])))
         if len(observations) >= LEAST_OBSERVATIONS:
-            observations = self._without_odd_views(observations, known)
+            observations = self.without_odd_views(observations, known)
             observations = self._steady(observations, fit_offsets(observations, known, len(self.points)))
         if len(observations) < LEAST_OBSERVATIONS or np.count_nonzero(self._counts(observations)) < LEAST_POINTS:
             return None, "nearly all 3D points are on silhouettes only, or not steady"
@@ -162,7 +162,7 @@ class Consensus:
         enough = (counts - silhouettes >= LEAST_INSIDE) & (silhouettes <= MOST_SILHOUETTE * counts)
         return observations.keep(enough[observations.owners])
 
-    def _without_odd_views(self, observations: Observations, known: np.ndarray) -> Observations:
+    def without_odd_views(self, observations: Observations, known: np.ndarray) -> Observations:
         """The observations without silhouettes of views that disagree with the others on how far outside they lie.
 
         That is told from points placed by edgels inside alone.

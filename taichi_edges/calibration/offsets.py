@@ -93,7 +93,7 @@ def fit_offsets(observations: Observations, known: np.ndarray, count: int | None
     residuals = observations.offsets - np.median(observations.offsets)
     robust = _weights(residuals, redescending=False)
     for round_ in range(1, ABSOLUTE_ROUNDS + REDESCENDING_ROUNDS + 1):
-        values, displacements, matrix = _solve(observations, weights * robust, known, count)
+        values, displacements, matrix = solve_offsets(observations, weights * robust, known, count)
         residuals = _residuals(observations, values, displacements)
         robust = _weights(residuals, redescending=round_ >= ABSOLUTE_ROUNDS)
     return OffsetFit(values, displacements, residuals, weights * robust, robust, matrix)
@@ -160,7 +160,7 @@ def _residuals(observations: Observations, values: np.ndarray, displacements: np
     return observations.offsets - observations.columns @ values - observations.moved_by(displacements)
 
 
-def _solve(
+def solve_offsets(
     observations: Observations, weights: np.ndarray, known: np.ndarray, count: int | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Weighted least squares: values (3,), displacements (count, 2), and the matrix of the values' normal equations.
@@ -210,7 +210,7 @@ def _jackknife(
     labels = np.unique(groups)
     if len(labels) < 2:
         return np.full(3, NOTHING_KNOWN**2)
-    found = np.array([_solve(observations, weights * (groups != label), known, count)[0] for label in labels])
+    found = np.array([solve_offsets(observations, weights * (groups != label), known, count)[0] for label in labels])
     return (len(labels) - 1) * found.var(axis=0)
 
 

@@ -42,14 +42,14 @@ def evaluate(run: "Run") -> dict[str, Any]:
             edges.transformed(partial(transform, views.input_to_truth)) if truth.own_frame else unit, truth
         )
     scores |= held_out_metrics(exact_polylines(unit), views, held_out)
-    _warn_of_chance(scores, run.progress)
+    warn_of_chance(scores, run.progress)
     metrics = {**scores, "ground_truth": None if truth is None else truth.source}
     write_json(run.path("metrics.json"), metrics)
     write_csv(run.path("metrics.csv"), [("metric", "value"), *metrics.items()])
     return {**metrics, "files": _write_pseudo_truth(run, views, truth)}
 
 
-def _warn_of_chance(metrics: Mapping[str, float | None], progress: "Progress") -> None:
+def warn_of_chance(metrics: Mapping[str, float | None], progress: "Progress") -> None:
     """Say so where the edges are hardly better in the held-out views than edges displaced at random would be."""
     found, chance = (metrics.get(f"held_out_{name}_percent") for name in ("precision", "chance"))
     if found is not None and chance is not None and found < HARDLY_BETTER * chance:
@@ -71,13 +71,13 @@ def _ground_truth(run: "Run", views: Views, held_out: Views) -> "GroundTruth | N
         return read_ground_truth(path, to_unit) if path else None
     points = points_in_box(read_sampled_ply(path, to_unit).points, views.box, str(path))
     cameras = {some.names[view]: some.camera(view) for some in (views, held_out) for view in range(len(some))}
-    maps = _scan_maps(run, views, held_out)
+    maps = scan_maps(run, views, held_out)
     with run.progress.track("scan", len(maps)) as report:
         votes = Votes.of(points, [cameras[name] for name in maps], maps.values(), config.scan.threshold, report)
     return pseudo_truth(points, votes, config.scan, str(path))
 
 
-def _scan_maps(run: "Run", views: Views, held_out: Views) -> dict[str, np.ndarray]:
+def scan_maps(run: "Run", views: Views, held_out: Views) -> dict[str, np.ndarray]:
     """{name of a view: (H, W) uint8 edge map} that a scan's points are projected on."""
     folder, source = run.config.evaluation.scan.edges, run.config.source
     names = [*views.names, *held_out.names]

@@ -187,14 +187,14 @@ def _open_record(run: Run) -> dict[str, Any]:
         "arch": run.arch,
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
         "python": platform.python_version(),
-        "versions": _versions(tuple(package for stage in STAGES.values() for package in stage.packages)),
+        "versions": package_versions(tuple(package for stage in STAGES.values() for package in stage.packages)),
         "ran": [],
         "stages": {name: stage for name, stage in known if isinstance(stage, dict) and set(stage) >= STAGE_KEYS},
     }
 
 
 @functools.cache
-def _versions(more: tuple[str, ...] = ()) -> dict[str, str]:
+def package_versions(more: tuple[str, ...] = ()) -> dict[str, str]:
     """The versions of ourselves, of PACKAGES and of more, by name; without those that are not installed."""
     found = {"taichi_edges": taichi_edges.__version__}
     for package in (*PACKAGES, *more):
@@ -220,7 +220,7 @@ def _inputs(run: Run, stage: Stage) -> dict[str, Any]:
     """What the stage depends on: its settings, the versions, and the digest of every file it reads."""
     files = {artefact: digest_file(run.path(artefact)) for artefact in stage.reads}
     files |= {_label(run, path): digest_file(path) for path in stage.outside(run) if path.exists()}
-    return {"settings": _settings(run, stage), "files": files, "versions": _versions(stage.packages)}
+    return {"settings": _settings(run, stage), "files": files, "versions": package_versions(stage.packages)}
 
 
 def _label(run: Run, path: Path) -> str:

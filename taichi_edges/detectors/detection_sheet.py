@@ -85,11 +85,11 @@ def write_detection_sheet(
     assert on_silhouette is None or len(on_silhouette) == len(views.edgels)
     silhouette = None if on_silhouette is None else np.asarray(on_silhouette) >= 0.5
     residuals = None if residuals is None else np.asarray(residuals, dtype=np.float64)
-    limit, cell = _limit(residuals), _cell_size(views)
+    limit, cell = colour_limit(residuals), _cell_size(views)
     chosen = choose_views(views, count)
     rows = [_header(views, len(chosen), residuals, silhouette, limit, cell)]
     for view in chosen:
-        content = _content(views, view, residuals, silhouette, limit, cell, picture_reader or _read_picture)
+        content = content_of(views, view, residuals, silhouette, limit, cell, picture_reader or _read_picture)
         rows += [_row_title(views, view, content, cell), _row([draw(content, cell) for draw in _columns(residuals)])]
     written, encoded = cv2.imencode(".png", np.concatenate(rows)[:, :, ::-1])
     assert written
@@ -129,7 +129,7 @@ def _read_picture(path: str) -> np.ndarray | None:
     return None if picture is None else picture[:, :, ::-1]
 
 
-def _limit(residuals: np.ndarray | None) -> float:
+def colour_limit(residuals: np.ndarray | None) -> float:
     """px; the end of the colour bar: a round number that holds most of the residuals."""
     known = np.abs(residuals[np.isfinite(residuals)]) if residuals is not None else np.zeros(0)
     wanted = np.percentile(known, COVERED) if len(known) else LIMITS[0]
@@ -141,7 +141,7 @@ def _cell_size(views: Views) -> tuple[int, int]:
     return CELL_WIDTH, int(np.clip(round(CELL_WIDTH * views.height / views.width), *CELL_HEIGHTS))
 
 
-def _content(
+def content_of(
     views: Views,
     view: int,
     residuals: np.ndarray | None,
@@ -154,7 +154,7 @@ def _content(
     part = slice(views.edgels.starts[view], views.edgels.starts[view + 1])
     points, normals, strengths = views.edgels.of_view(view)
     off, outer = (None if values is None else values[part] for values in (residuals, silhouette))
-    window = _busiest(points, off, outer, (views.width, views.height), cell)
+    window = busiest_window(points, off, outer, (views.width, views.height), cell)
     photo, edge_map = _photo(views, view, picture_reader), views.edge_maps[view]
     picture = cv2.cvtColor(255 - edge_map, cv2.COLOR_GRAY2RGB) if photo is None else photo
     return Content(picture, photo is not None, edge_map, points, normals, strengths, off, outer, window, limit)
@@ -171,7 +171,7 @@ def _photo(views: Views, view: int, picture_reader: Callable[[str], np.ndarray |
     return cv2.resize(picture, (views.width, views.height), interpolation=cv2.INTER_AREA)
 
 
-def _busiest(
+def busiest_window(
     points: np.ndarray,
     residuals: np.ndarray | None,
     silhouette: np.ndarray | None,
@@ -189,13 +189,13 @@ def _busiest(
     if not len(points):
         return (size[0] - width) // 2, (size[1] - height) // 2, width, height
     kinds = [counted] if silhouette is None else [counted & silhouette, counted & ~silhouette]
-    sums = [_window_sums(points[kind], size, (width, height)) for kind in kinds]
+    sums = [window_sums(points[kind], size, (width, height)) for kind in kinds]
     score = sum(sums) + MIXED * np.minimum.reduce(sums)
     top, left = np.unravel_index(np.argmax(score), score.shape)
     return int(left), int(top), width, height
 
 
-def _window_sums(points: np.ndarray, size: tuple[int, int], window: tuple[int, int]) -> np.ndarray:
+def window_sums(points: np.ndarray, size: tuple[int, int], window: tuple[int, int]) -> np.ndarray:
     """How many points lie in each place of a window in an image; both sizes are (width, height) px."""
     columns, rows = (
         np.clip(np.rint(values), 0, side - 1).astype(int) for values, side in zip(points.T, size, strict=True)
@@ -212,7 +212,7 @@ def _window_sums(points: np.ndarray, size: tuple[int, int], window: tuple[int, i
 def _columns(residuals: np.ndarray | None) -> list[Column]:
     """The cells of a row, from left to right: functions (content, cell) -> (h, w, 3) uint8."""
     return [_whole_picture, _whole_map, _whole_edgels, _magnified_edgels] + (
-        [_magnified_residuals, _histograms] if residuals is not None else []
+        [magnified_residuals, _histograms] if residuals is not None else []
     )
 
 
@@ -242,7 +242,7 @@ def _magnified_edgels(content: Content, cell: tuple[int, int]) -> np.ndarray:
     return _magnified(content, cell, strength_colours(content.strengths))
 
 
-def _magnified_residuals(content: Content, cell: tuple[int, int]) -> np.ndarray:
+def magnified_residuals(content: Content, cell: tuple[int, int]) -> np.ndarray:
     assert content.residuals is not None  # else there is no such column
     return _magnified(content, cell, residual_colours(content.residuals, content.limit))
 
@@ -340,7 +340,7 @@ HEADINGS: dict[Column, tuple[str, str]] = {
     _whole_map: ("edge map", "what the splatting learns from"),
     _whole_edgels: ("edgels", "framed: the part that is magnified"),
     _magnified_edgels: ("edgels, magnified", ""),
-    _magnified_residuals: ("residuals, magnified", ""),
+    magnified_residuals: ("residuals, magnified", ""),
     _histograms: ("residuals", "outwards positive; red: median"),
 }
 
@@ -368,7 +368,7 @@ def _header(
         _write(picture, heading, (left, 4 * LINE - 4), bold=True)
         if column is _magnified_edgels:
             _bar(picture, (left, 4 * LINE + 4), strength_colours, (0.0, 0.5, 1.0), "{:g}", "strength", cell)
-        elif column is _magnified_residuals:
+        elif column is magnified_residuals:
             ticks = (-limit, 0.0, limit)
             _bar(picture, (left, 4 * LINE + 4), lambda r: residual_colours(r, limit), ticks, "{:+g}", "px", cell)
         else:
@@ -417,7 +417,7 @@ def _row_title(views: Views, view: int, content: Content, cell: tuple[int, int])
     name = _shortened(views.names[view], cell[0] - _text_width(what, bold=True)) + what
     words: dict[Column, str] = {_whole_picture: name, _whole_edgels: count, _magnified_edgels: magnified}
     if content.residuals is not None:
-        words[_magnified_residuals] = f"{np.isfinite(content.residuals).sum()} with a residual"
+        words[magnified_residuals] = f"{np.isfinite(content.residuals).sum()} with a residual"
     for place, column in enumerate(columns):
         left, bold = GAP + place * (cell[0] + GAP), column is _whole_picture
         _write(picture, words.get(column, ""), (left, LINE), bold=bold, room=cell[0])

@@ -268,7 +268,7 @@ class _Network:
             raise self._refused_by_both(error) from error
 
     def _change_over(self, error: Exception) -> None:
-        self.reason = _condensed(error)
+        self.reason = condensed(error)
         try:
             runtime = importlib.import_module("onnxruntime")
         except ImportError:
@@ -283,11 +283,11 @@ class _Network:
             raise self._refused_by_both(second) from second
 
     def _refused_by_both(self, error: Exception) -> UserError:
-        reasons = f"OpenCV: {self.reason}; onnxruntime: {_condensed(error)}"
+        reasons = f"OpenCV: {self.reason}; onnxruntime: {condensed(error)}"
         return UserError(f"{self.path}: cannot be run ({reasons}); export the model again, or make the images smaller")
 
 
-def _condensed(error: Exception) -> str:
+def condensed(error: Exception) -> str:
     """The reason in another library's message: the operator where it names one, else its last statement."""
     text = " ".join(str(error).split())
     if unknown := re.search(r'of type "(\w+)"', text):

@@ -16,7 +16,7 @@ SAME_EDGE = 2.5  # a pixel supports the points within this many line widths (in 
 WIDTH_VIEWS = 64  # the width of the lines is measured in so many views at most
 
 # (id of Views, threshold): line width in pixels; an entry goes with its Views.
-_widths: dict[tuple[int, float], float] = {}
+known_widths: dict[tuple[int, float], float] = {}
 
 
 def edge_strength(views: Views, points: np.ndarray) -> np.ndarray:
@@ -39,10 +39,10 @@ def line_width(views: Views, threshold: float) -> tuple[float, float]:
     threshold: of full scale. Measured once for each Views.
     """
     key = (id(views), threshold)
-    if key not in _widths:
-        _widths[key] = _measure_width(views.edge_maps[:: -(-len(views) // WIDTH_VIEWS)], threshold)
-        weakref.finalize(views, _widths.pop, key, None)
-    return _widths[key], _widths[key] * pixel_size(views)
+    if key not in known_widths:
+        known_widths[key] = _measure_width(views.edge_maps[:: -(-len(views) // WIDTH_VIEWS)], threshold)
+        weakref.finalize(views, known_widths.pop, key, None)
+    return known_widths[key], known_widths[key] * pixel_size(views)
 
 
 def _measure_width(edge_maps: np.ndarray, threshold: float) -> float:

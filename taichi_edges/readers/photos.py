@@ -107,7 +107,7 @@ def _solved(
 
     registered, unreadable: names of photographs. files: {name: digest} of the model's.
     """
-    groups = _by_camera(images, names, threads)
+    groups = by_camera(images, names, threads)
     grouped = {name for group in groups for name in group}
     readable = [name for name in names if name in grouped]
     _refuse_few(images, readable)
@@ -168,7 +168,7 @@ def _digests(folder: Path) -> dict[str, str]:
     return {path.name: digest_file(path) for path in model_files(folder)}
 
 
-def _by_camera(images: Path, names: list[str], threads: int) -> list[list[str]]:
+def by_camera(images: Path, names: list[str], threads: int) -> list[list[str]]:
     """Lists of names that share a camera: of one folder, one size, one focal length; without what is no image."""
 
     def kind(name: str) -> tuple[str, tuple[int, int] | None, float | None] | None:

@@ -199,7 +199,7 @@ class Training:
             first = max(round(self.config.flanks_from * self.total), 1)
             culls = {max(round(share * self.total), 1) for share in config.cull_support_at}
             for step in sorted({first, *(step for step in culls if step > first)}):
-                actions.setdefault(step, []).append(self._take_in_flanks)
+                actions.setdefault(step, []).append(self.take_in_flanks)
         return actions
 
     def _control_density(self, step: int) -> None:
@@ -234,7 +234,7 @@ class Training:
     def _cull_opacity(self, population: Population) -> Population:
         return self._limit_opacity(density.cull_opacity(population, self.config.density.min_opacity))
 
-    def _take_in_flanks(self, population: Population) -> Population:
+    def take_in_flanks(self, population: Population) -> Population:
         """The mask with the flanks of the lines, except where an edge that other views have established is hidden."""
         config, gaussians = self.config, population.gaussians
         points = np.zeros((0, 3))

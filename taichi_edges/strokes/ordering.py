@@ -42,7 +42,7 @@ def connected_graph(points: np.ndarray) -> csr_array:
     full = full.maximum(full.T)
     pieces, labels = connected_components(full, directed=False)
     if pieces > 1:
-        full = _bridge(points, full, labels)
+        full = join_pieces(points, full, labels)
     tree = minimum_spanning_tree(full)
     if tree.nnz:
         full.data[full.data > REACH * tree.data.max()] = 0.0
@@ -50,7 +50,7 @@ def connected_graph(points: np.ndarray) -> csr_array:
     return full
 
 
-def _bridge(points: np.ndarray, graph: csr_array, labels: np.ndarray) -> csr_array:
+def join_pieces(points: np.ndarray, graph: csr_array, labels: np.ndarray) -> csr_array:
     """Join the pieces of a graph by their shortest connections, one piece after the other to that of label 0."""
     pieces = members_of_clusters(labels)
     newest, outside = pieces[0], np.flatnonzero(labels)
