@@ -100,10 +100,10 @@ def read_entities(path):
     """{reference: {keyword: values}} of a file, after all checks."""
     text = path.read_bytes().decode("ascii")
     head, data, tail = re.fullmatch(
-        r"(ISO-10303-21;\nHEADER;\n.*?ENDSEC;\n)DATA;\n(.*)(ENDSEC;\n.*)", text, re.S
+        r"(ISO-10303-21;\nHEADER;\n.*?ENDSEC;\n)DATA;\n(.*)(ENDSEC;\n.*)", text, re.DOTALL
     ).groups()
     assert tail == "ENDSEC;\nEND-ISO-10303-21;\n"
-    assert re.findall(r"^(\w+)\(", head, re.M) == ["FILE_DESCRIPTION", "FILE_NAME", "FILE_SCHEMA"]
+    assert re.findall(r"^(\w+)\(", head, re.MULTILINE) == ["FILE_DESCRIPTION", "FILE_NAME", "FILE_SCHEMA"]
     entities = {}
     for line in data.splitlines():
         tokens = tokens_of(line)

@@ -209,7 +209,8 @@ def test_the_same_edges_give_the_same_bytes_in_every_process(tmp_path, suffix):
     """Python orders sets of strings by a random number of the process."""
     source = write_wireframe(tmp_path / "edges.json", house(), {})
     code = (
-        "import sys; from taichi_edges.exporters import EXPORTERS; from taichi_edges.geometry.wireframe import read_wireframe; "
+        "import sys; from taichi_edges.exporters import EXPORTERS; "
+        "from taichi_edges.geometry.wireframe import read_wireframe; "
         f"[EXPORTERS[{suffix!r}](path, read_wireframe(sys.argv[1])[0]) for path in sys.argv[2:]]"
     )
     written = set()
@@ -357,7 +358,7 @@ def test_a_cad_kernel_reads_the_same_edges(tmp_path, wireframe):
         assert GCPnts_AbscissaPoint.Length_s(curve, limit) == pytest.approx(millimetres * shape.length, rel=1e-4)
         if shape.kind in ("arc", "circle"):
             assert curve.Circle().Radius() == pytest.approx(millimetres * shape.radii[0], rel=1e-12)
-        for end, of in zip(edge.vertices, (TopExp.FirstVertex_s, TopExp.LastVertex_s), strict=False):
+        for end, of in zip(edge.vertices, (TopExp.FirstVertex_s, TopExp.LastVertex_s), strict=True):
             vertex = of(body, False)
             assert vertex.IsSame(vertices.setdefault(end, vertex))  # edges that meet share it
             assert BRep_Tool.Tolerance_s(vertex) <= 1e-6 * millimetres * longest_side(wireframe)

@@ -1,4 +1,4 @@
-"""The file between the stages `cluster` and `fit`: all of it comes back, and what is wrong with it is said in a line."""
+"""The file between the stages `cluster` and `fit`: all of it comes back; what is wrong with it is said in a line."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,7 @@
 """Strokes that continue each other become one edge, those that repeat others go, and neither joins what is apart."""
 
+import itertools
+
 import numpy as np
 import pytest
 from placed_shapes import PLANE, Placing, any_shape
@@ -135,7 +137,7 @@ def test_bad_stroke_in_the_middle_is_overruled(generator, kind, seed):
 def test_fillet_between_two_lines_stays_an_arc_between_lines(generator, radius, seed):
     fillet = arc(-np.pi / 2, 0, radius)
     true = [line((-0.2, -radius), (0, -radius)), fillet, line((radius, 0), (radius, 0.25))]
-    strokes, place = strokes_of([part(shape, 0.02, 0.98) for shape in true], generator, 0.2 * NOISE)
+    strokes, _place = strokes_of([part(shape, 0.02, 0.98) for shape in true], generator, 0.2 * NOISE)
     found, counts = continued(strokes, YARDSTICK, everywhere)
     assert sorted(shape.kind for shape in found) == ["arc", "line", "line"] and counts == Merging()
     assert same_places(found, strokes, 1e-12)
@@ -192,7 +194,7 @@ def test_every_stroke_is_in_one_path_once(generator, seed):
     assert sorted((len(path), closes) for path, closes in paths) == [(1, False), (1, False), (3, False), (3, True)]
     for path, _ in paths:
         ends = [strokes[number].ends[::-1] if turned else strokes[number].ends for number, turned in path]
-        assert all(np.linalg.norm(a[1] - b[0]) < 12 * PIXEL for a, b in zip(ends, ends[1:]))
+        assert all(np.linalg.norm(a[1] - b[0]) < 12 * PIXEL for a, b in itertools.pairwise(ends))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -201,8 +203,8 @@ def test_strokes_that_come_back_to_their_start_are_one_ellipse(generator, pieces
     """Chains of cubics with gaps between them, also between the two ends of a single one."""
     whole = EllipticArc(np.zeros(3), np.array([[0.2, 0, 0], [0, 0.11, 0]]), 0.0, 2 * np.pi)
     joints = np.linspace(0.3, 0.3 + 2 * np.pi, pieces + 1)
-    strokes = [Spline(whole.over(low + 0.02, high - 0.02).cubics()) for low, high in zip(joints, joints[1:])]
-    strokes, placing = strokes_of(strokes, generator)
+    strokes = [Spline(whole.over(low + 0.02, high - 0.02).cubics()) for low, high in itertools.pairwise(joints)]
+    strokes, _placing = strokes_of(strokes, generator)
     found, _ = continued(strokes, YARDSTICK, everywhere)
     assert [shape.kind for shape in found] == ["ellipse"]
     np.testing.assert_allclose(found[0].radii, [0.2, 0.11], atol=NOISE)
@@ -224,7 +226,7 @@ def test_strokes_round_a_gap_that_no_image_shows_stay_open(generator, seed):
 @pytest.mark.parametrize("cuts", [(0.0, 0.5), (0.0, 0.3, 0.65), (0.0, 0.2, 0.5, 0.6)])
 def test_parts_of_a_circle_become_the_circle(generator, cuts, seed):
     whole = arc(0, 2 * np.pi)
-    parts = [part(whole, a, b - 0.01) for a, b in zip(cuts, (*cuts[1:], 1.0))]
+    parts = [part(whole, a, b - 0.01) for a, b in zip(cuts, (*cuts[1:], 1.0), strict=True)]
     strokes, place = strokes_of(parts, generator, 0.3 * NOISE)
     found, counts = continued(strokes, YARDSTICK, everywhere)
     assert [shape.kind for shape in found] == ["circle"] and counts.circles == 1
@@ -249,7 +251,7 @@ def test_less_than_half_a_circle_says_nothing_of_the_rest(generator):
 def test_line_that_touches_a_circle_stays(generator, seed):
     whole = arc(0, 2 * np.pi)
     parts = [part(whole, 0, 0.49), part(whole, 0.5, 0.99), line((0.15, 0), (0.15, 0.2))]
-    strokes, place = strokes_of(parts, generator, 0.3 * NOISE)
+    strokes, _place = strokes_of(parts, generator, 0.3 * NOISE)
     found, circles = with_whole_circles(strokes, YARDSTICK, everywhere)
     assert circles == 1 and sorted(shape.kind for shape in found) == ["circle", "line"]
 

@@ -107,7 +107,7 @@ def test_drawn_ridges_match_a_pixel_by_pixel_drawing(generator):
     points, angles, values = generator.uniform(0, 29, (30, 2)), generator.uniform(0, 7, 30), generator.random(30)
     normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     expected = np.zeros((30, 30))
-    for point, normal, value in zip(points, normals, values):
+    for point, normal, value in zip(points, normals, values, strict=True):
         for row, column in np.ndindex(30, 30):
             away = np.array([column, row]) - point
             if np.abs(np.array([column, row]) - np.rint(point)).max() <= PATCH:

@@ -1,4 +1,4 @@
-"""What the tests hold to: they use public names, their random numbers can be repeated, and what they share has a file."""
+"""What the tests hold to: public names, random numbers that can be repeated, a file for what they share."""
 
 import ast
 from pathlib import Path

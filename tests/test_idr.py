@@ -210,6 +210,6 @@ def test_scan37_is_read():
     side = frames.box[1] - frames.box[0]
     np.testing.assert_allclose(side, 512.1, atol=0.1)  # millimetres
     # DTU's robot looks at the object: the box's centre is in every image.
-    for intrinsics, pose in zip(frames.intrinsics, frames.camera_to_world):
+    for intrinsics, pose in zip(frames.intrinsics, frames.camera_to_world, strict=True):
         pixel, depth = project(frames.box.mean(axis=0)[None], intrinsics(1600, 1200), invert_pose(pose))
         assert depth[0] > 500 and inside_image(pixel, 1600, 1200)[0]

@@ -187,7 +187,7 @@ def test_line_meets_its_fillet_in_the_tangent_point(generator, radius, seed):
 def test_arc_keeps_its_side(generator, angle, seed):
     """Its ends are moved to those of two lines; arcs of more than half a round do not become the rest of it."""
     arc = EllipticArc(np.zeros(3), 0.1 * PLANE, 0.0, angle)
-    lines = [line(end, end + [0, 0, way]) for end, way in zip(arc.ends, (0.2, -0.2))]
+    lines = [line(end, end + [0, 0, way]) for end, way in zip(arc.ends, (0.2, -0.2), strict=True)]
     shapes, place = loosened([arc, *lines], generator, 2.0)
     found = connected(shapes, PIXEL)
     check(found, shapes)
@@ -202,7 +202,7 @@ def test_arc_keeps_its_side(generator, angle, seed):
 @pytest.mark.parametrize("kind", ["spline", "elliptic_arc"])
 def test_other_curves_end_exactly_where_they_meet(generator, kind, seed):
     curve = any_shape(kind, generator)
-    stems = [line(end, end + way) for end, way in zip(curve.ends, generator.normal(size=(2, 3)))]
+    stems = [line(end, end + way) for end, way in zip(curve.ends, generator.normal(size=(2, 3)), strict=True)]
     for number, stem in enumerate(stems):  # across the curve, so that they do not run on along it
         along = curve.tangents(float(number))
         way = np.cross(along, generator.normal(size=3))
@@ -227,11 +227,14 @@ def test_end_on_the_middle_of_an_edge_is_a_contact(generator, kind, seed):
     while touched.length < 24 * PIXEL:  # nearer to its ends than they reach, these would meet
         touched = any_shape(kind, generator)
     place, along = touched.at(np.array([t]))[0], touched.tangents(t)
-    way = np.cross(along, generator.normal(size=3))
-    way /= np.linalg.norm(way)
+    far = place
+    while distances_to(touched, far[None])[0] < 24 * PIXEL:  # the far end must not meet it as well
+        way = np.cross(along, generator.normal(size=3))
+        way /= np.linalg.norm(way)
+        far = place + 0.3 * way
     start = place + generator.uniform(-4, 4) * PIXEL * way
-    found = connected([touched, line(start, place + 0.3 * way)], PIXEL)
-    check(found, [touched, line(start, place + 0.3 * way)])
+    found = connected([touched, line(start, far)], PIXEL)
+    check(found, [touched, line(start, far)])
     vertex, edge = found.contacts[0]
     assert len(found.contacts) == 1 and edge == 0 and vertex == found.edges[1].vertices[0]
     assert np.linalg.norm(found.vertices[vertex] - place) < PIXEL and found.degrees[vertex] == 2
@@ -241,7 +244,7 @@ def test_end_on_the_middle_of_an_edge_is_a_contact(generator, kind, seed):
 def test_corner_on_a_face_of_another_part_is_one_contact(generator, seed):
     """Two lines meet in a third one, between its ends."""
     true = [line((-0.2, 0, 0), (0.2, 0, 0)), line((0, 0, 0), (0, 0.2, 0)), line((0, 0, 0), (0.05, 0, 0.2))]
-    shapes, place = loosened(true, generator, 2.0, 0.1)
+    shapes, _place = loosened(true, generator, 2.0, 0.1)
     found = connected(shapes, PIXEL)
     check(found, shapes)
     assert len(found.vertices) == 5 and len(found.contacts) == 1 and found.contacts[0, 1] == 0

@@ -32,7 +32,7 @@ def python(*arguments, cwd, **environment):
     """The finished process of an interpreter that finds the package but is not in its folder."""
     command = [sys.executable, *map(str, arguments)]
     environment = {"PYTHONPATH": str(ROOT), "PATH": "", "HOME": str(cwd), **environment}
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=environment, timeout=120)
+    return subprocess.run(command, capture_output=True, check=False, text=True, cwd=cwd, env=environment, timeout=120)
 
 
 @pytest.fixture

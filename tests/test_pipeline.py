@@ -126,7 +126,9 @@ def start(arguments, code=None, cwd=ROOT, **environment):
     environment = {**{key: value for key, value in os.environ.items() if key != "TAICHI_EDGES_DATA"}, **environment}
     head = [sys.executable, "-c", code] if code else [sys.executable, str(ROOT / "run.py")]
     tail = [] if code else arguments
-    return subprocess.run([*head, *tail], capture_output=True, text=True, cwd=cwd, env=environment, timeout=300)
+    return subprocess.run(
+        [*head, *tail], capture_output=True, check=False, text=True, cwd=cwd, env=environment, timeout=300
+    )
 
 
 def succeed(arguments, **options):
@@ -463,7 +465,7 @@ def test_until_stops_there(copied):
     ],
 )
 def test_summary_names_the_edges_as_far_as_they_have_come(copied, capsys, until, results):
-    scene, runs, folder = copied
+    scene, _runs, folder = copied
     record, _ = rerun(copied, until=until)
     print_summary(Run(load_scene(scene), folder), record, until)
     assert capsys.readouterr().out.splitlines()[-1] == f"results: {folder}/  ({', '.join(results)})"
@@ -728,7 +730,7 @@ def test_what_is_up_to_date_or_mistaken_waits_for_no_library(copied):
     )
     for settings, status in ((), 0), (("--set", "train.epoch=3"), 2):
         arguments = [sys.executable, "-c", code, *command(scene, runs, *settings)]
-        done = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, check=False)
+        done = subprocess.run(arguments, cwd=ROOT, capture_output=True, check=False, text=True, check=False)
         assert (done.returncode, done.stdout.splitlines()[-1]) == (status, "imported:")
 
 
@@ -780,10 +782,9 @@ def test_terminal_progress_prints_texts_as_they_are(capsys):
 def test_a_failed_write_leaves_the_old_file_and_no_temporary_one(tmp_path):
     path = tmp_path / "file.txt"
     path.write_text("old")
-    with pytest.raises(RuntimeError):
-        with replacing(path) as unfinished:
-            unfinished.write_text("half")
-            raise RuntimeError
+    with pytest.raises(RuntimeError), replacing(path) as unfinished:
+        unfinished.write_text("half")
+        raise RuntimeError
     assert [each.name for each in tmp_path.iterdir()] == ["file.txt"] and path.read_text() == "old"
 
 

@@ -189,7 +189,7 @@ def test_the_current_folder_has_a_name(tmp_path, monkeypatch):
 
 def run(*arguments, cwd):
     command = [sys.executable, str(ROOT / "run.py"), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=120)
+    return subprocess.run(command, capture_output=True, check=False, text=True, cwd=cwd, timeout=120)
 
 
 def test_a_folder_runs_without_a_scene_file(tmp_path):

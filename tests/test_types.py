@@ -12,8 +12,8 @@ def public_functions(tree):
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
             yield from ((f"{node.name}.{name}", function) for name, function in public_functions(node))
         elif isinstance(node, ast.FunctionDef) and (not node.name.startswith("_") or node.name == "__init__"):
-            if not any("ti." in ast.unparse(decorator) for decorator in node.decorator_list):
-                yield node.name, node
+            decorators = [ast.unparse(decorator) for decorator in node.decorator_list]
+            yield from [] if any("ti." in decorator for decorator in decorators) else [(node.name, node)]
 
 
 def untyped(node):

@@ -45,7 +45,11 @@ def test_pixel_at_points_is_the_median_of_what_each_view_sees():
     poses = np.stack([look_at(middle, middle + forward) for forward in ahead])
     # A camera turns in the middle of four walls 1, 2, 3 and 4 away, each with a point far behind it, too.
     depths = np.array([1.0, 2.0, 3.0, 4.0])
-    walls = [middle + depth * forward + shift for depth, forward in zip(depths, ahead) for shift in np.eye(3) * 0.01]
+    walls = [
+        middle + depth * forward + shift
+        for depth, forward in zip(depths, ahead, strict=True)
+        for shift in np.eye(3) * 0.01
+    ]
     points = np.array([*walls, middle + 100 * ahead[0]])
     assert pixel_at(points, intrinsics, poses, (SIZE, SIZE)) == pytest.approx(2.5 / 400, rel=0.01)
     assert pixel_at(points, intrinsics[:1], poses[:1], (SIZE, SIZE)) == pytest.approx(1.0 / 400, rel=0.01)

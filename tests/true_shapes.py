@@ -1,5 +1,7 @@
 """Hand-made ground truths, and truths written as predictions."""
 
+import itertools
+
 import numpy as np
 
 from taichi_edges.evaluation.ground_truth import GroundTruth
@@ -17,7 +19,7 @@ def truth_of(*polylines, spacing=0.0005):
     polylines = tuple(np.asarray(polyline, dtype=np.float64) for polyline in polylines)
     points, length = [], 0.0
     for polyline in polylines:
-        for start, end in zip(polyline[:-1], polyline[1:], strict=True):
+        for start, end in itertools.pairwise(polyline):
             size = np.linalg.norm(end - start)
             points.append(start + np.linspace(0, 1, int(np.ceil(size / spacing)) + 1)[:, None] * (end - start))
             length += size
@@ -43,7 +45,7 @@ def truth_as_edges(truth):
             continue
         pieces = int(np.ceil((len(polyline) - 1) / segments))
         borders = np.linspace(0, len(polyline) - 1, pieces + 1).astype(int)
-        curves += [fit_cubic(polyline[a : b + 1]) for a, b in zip(borders[:-1], borders[1:], strict=True)]
+        curves += [fit_cubic(polyline[a : b + 1]) for a, b in itertools.pairwise(borders)]
         sources += [number] * pieces
     line_sources = len(truth.curves) + np.arange(len(lines))
     return EdgeSet(np.array(lines), np.array(curves), line_sources, np.array(sources))
