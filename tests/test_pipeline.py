@@ -730,7 +730,7 @@ def test_what_is_up_to_date_or_mistaken_waits_for_no_library(copied):
     )
     for settings, status in ((), 0), (("--set", "train.epoch=3"), 2):
         arguments = [sys.executable, "-c", code, *command(scene, runs, *settings)]
-        done = subprocess.run(arguments, cwd=ROOT, capture_output=True, check=False, text=True, check=False)
+        done = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, check=False)
         assert (done.returncode, done.stdout.splitlines()[-1]) == (status, "imported:")
 
 
