@@ -1,5 +1,6 @@
 # make demo   set up .venv if needed, run the embedded demo, say where the pictures are
-# make test   set up .venv if needed, run the tests
+# make test   set up .venv if needed, run the tests; another set of random inputs: make test TEST_SEED=7
+# make quick  the tests without those marked slow: for the inner loop
 # make lock   resolve requirements.lock anew from setup.cfg (needs uv)
 # make clean  remove .venv and runs
 # Python 3.10 to 3.12; another one than python3: make demo PYTHON=python3.12
@@ -7,13 +8,21 @@
 PYTHON ?= python3
 VENV ?= .venv
 RUN := $(VENV)/bin/python
+WORKERS ?= 2
+TEST_SEED ?= 0
+export TEST_SEED
+# A file of tests stays in one process, for its fixtures and kernels; in the files' order, of which the last are short.
+TESTS := $(RUN) -m pytest -q -rs -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test setup lock clean
+.PHONY: demo test quick setup lock clean
 demo: setup
 	$(RUN) run.py scenes/demo.yaml
 
 test: setup
-	$(RUN) -m pytest -q -rs
+	$(TESTS)
+
+quick: setup
+	$(TESTS) -m "not slow"
 
 setup: $(VENV)/ready
 	@sh tools/system-libraries $(RUN)
