@@ -3,8 +3,13 @@
 PYTHON ?= python3
 VENV ?= .venv
 RUN := $(VENV)/bin/python
+WORKERS ?= 2
+TEST_SEED ?= 0
+export TEST_SEED
+# A file of tests stays in one process, for its fixtures and kernels; in the files' order, of which the last are short.
+TESTS := $(RUN) -m pytest -q -rs -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: help demo test lint setup lock clean
+.PHONY: help demo quick test lint setup lock clean
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo "Python 3.10 to 3.12; another one than $(PYTHON): make demo PYTHON=python3.12"
@@ -12,8 +17,11 @@ help: ## list the targets
 demo: setup ## run the embedded demo scene, no download; results in runs/demo/
 	$(RUN) run.py scenes/demo.yaml
 
-test: setup ## run all tests
-	$(RUN) -m pytest -q -rs
+quick: setup ## run the tests without those marked slow: for the inner loop
+	$(TESTS) -m "not slow"
+
+test: setup ## run all tests; with other random inputs: make test TEST_SEED=7
+	$(TESTS)
 
 lint: setup ## format, lint, types
 	$(RUN) -m ruff format --check --quiet .

@@ -1,5 +1,7 @@
 """The splat and the image loss written plainly and differentiated by Taichi: the oracle of the hand-written adjoint."""
 
+from functools import lru_cache
+
 import taichi as ti
 from reference_splatting import selected
 
@@ -73,6 +75,12 @@ class AutodiffSplat:
             self.image_loss(slots, arrays[1], arrays[2], self.loss)
         kept.extend(arrays)
         return self.transmittance.to_numpy()[:slots]
+
+
+@lru_cache(maxsize=None)
+def autodiff_of(splatter):
+    """The AutodiffSplat of a Splatter; its kernels are built once."""
+    return AutodiffSplat(splatter)
 
 
 kept = []  # ndarrays that are freed after a second ti.init damage the new program: these are freed at the end

@@ -5,16 +5,25 @@ import os
 import subprocess
 import sys
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 import taichi as ti
 
+from taichi_edges.corridor.pipeline import Run
+from taichi_edges.kernels.device import is_running
 from taichi_edges.splatting.splatter import Splatter
+from taichi_edges.synthetic.drawing import Imperfections
+from taichi_edges.synthetic.parts import PARTS
+from taichi_edges.synthetic.rendering import render_views
 
-SEED = int(os.environ.get("TEST_SEED", np.random.SeedSequence().generate_state(1)[0]))
+# In the environment, so that pytest-xdist's workers have the same.
+SEED = int(os.environ.setdefault("TEST_SEED", str(np.random.SeedSequence().generate_state(1)[0])))
 REALS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
+# What uses one of these fixtures is slow, as if it were marked so.
+SLOW_FIXTURES = {"finished": "starts from a run of the whole corridor", "solved": "starts from solved photographs"}
 PROBE = """
 import sys
 import taichi as ti
@@ -24,9 +33,23 @@ sys.exit(ti.lang.impl.current_cfg().arch != getattr(ti, sys.argv[1]))
 """
 
 
-def pytest_report_header():
-    """The seed of this run's random inputs."""
-    return f"random inputs: repeat with TEST_SEED={SEED}"
+def pytest_configure(config):
+    """Kernels of all tests, and of the runs that they start, are kept in pytest's cache: a second run compiles none."""
+    os.environ["XDG_CACHE_HOME"] = str(config.cache.mkdir("kernels"))
+
+
+def pytest_terminal_summary(terminalreporter):
+    """The seed of this run's random inputs; a header would be missing with -q."""
+    terminalreporter.write_line(f"random inputs: repeat with TEST_SEED={SEED}")
+
+
+def pytest_itemcollected(item):
+    """A test is slow for a reason."""
+    for name in SLOW_FIXTURES.keys() & set(item.fixturenames):
+        item.add_marker(pytest.mark.slow(reason=SLOW_FIXTURES[name]))
+    for marker in item.iter_markers("slow"):
+        if marker.args or not marker.kwargs.get("reason"):
+            raise pytest.UsageError(f"{item.nodeid}: say why: @pytest.mark.slow(reason='...')")
 
 
 @cache
@@ -52,13 +75,26 @@ def generator(request):
 
 
 @pytest.fixture(scope="session")
-def start_taichi(pytestconfig):
+def clean_block():
+    """clean_block(count, size) -> (Views, pictures) of the block with clean edge maps, not to be changed; drawn once."""
+
+    @cache
+    def rendered(count, size):
+        views, pictures = render_views(PARTS["block"](), count, size, Imperfections.none(), np.random.default_rng(0))
+        for array in (views.edge_maps, pictures):
+            array.flags.writeable = False
+        return views, pictures
+
+    return rendered
+
+
+@pytest.fixture(scope="session")
+def start_taichi():
     """start_taichi(real, threads, arch): ti.init. All fields and ndarrays of the last program become invalid.
 
-    A test that wants a GPU is skipped where there is none: ti.init would fall back to the CPU. Kernels are cached in
-    pytest's cache folder: a second run compiles nothing.
+    A test that wants a GPU is skipped where there is none: ti.init would fall back to the CPU.
     """
-    cache = pytestconfig.cache.mkdir("taichi")
+    kernels = Run(None, Path()).kernel_cache
 
     def start(real, threads, arch="cpu"):
         if arch != "cpu" and not offers(arch):
@@ -70,11 +106,18 @@ def start_taichi(pytestconfig):
             default_fp=REALS[real],
             cpu_max_num_threads=threads,
             offline_cache=True,
-            offline_cache_file_path=str(cache),
+            offline_cache_file_path=str(kernels),
             log_level=ti.ERROR,
         )
 
     return start
+
+
+@pytest.fixture
+def taichi(start_taichi):
+    """Taichi in f32 with 2 threads: the program that runs already, if it is one, as its kernels have been built."""
+    if not is_running("cpu", 2):
+        start_taichi("f32", 2)
 
 
 @pytest.fixture(scope="session")
@@ -82,7 +125,8 @@ def open_splatter(start_taichi):
     """open_splatter(scene, real, threads, arch, **options of Splatter) -> Splatter.
 
     Nobody keeps a Splatter, because Taichi has one program at a time: every test opens the one it needs, and gets the
-    one that is open already if it fits.
+    one that is open already if it fits. Each has a program of its own: kernels that found other fields before theirs
+    would not be those in the cache.
     """
     is_open = {"key": None}
     old = []  # never freed: see start_taichi

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from edgel_scenes import line, views_of
+from edgel_scenes import either_errors, line, views_of
 
 from taichi_edges.evidence.edgel_matching import EdgelMatching
 from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
@@ -35,11 +35,6 @@ SHAPES = {
     "spline": WAVE,
 }
 OPEN = [kind for kind, shape in SHAPES.items() if not shape.closed]
-
-
-@pytest.fixture
-def taichi(start_taichi):
-    start_taichi("f32", 2)
 
 
 def curve_of(shape):
@@ -117,20 +112,25 @@ def test_nearest_places(kind, generator):
     np.testing.assert_allclose(found, parameters, atol=1e-5)
 
 
+@either_errors("0.04 to 0.06 px off where 0.05 are asked, in 6 to 16 of 40 draws")
 @pytest.mark.parametrize("kind", SHAPES)
-def test_moved_edge_returns(taichi, generator, kind):
+def test_moved_edge_returns(taichi, generator, kind, errors):
     true = SHAPES[kind]
-    matching = EdgelMatching(views_of([curve_of(true)], generator, noise_px=0.1))
-    start = disturbed(true, 0.7 * matching.pixel, generator)
+    matching = EdgelMatching(views_of([curve_of(true)], generator, noise_px=0.1, errors=errors))
+    starts = (disturbed(true, 0.7 * matching.pixel, generator) for _ in range(20))
+    start = next(each for each in starts if off(each, true) > 0.2 * matching.pixel)  # by chance some are hardly moved
     found = adjusted(Wireframe.loose([start]), matching).edges[0].shape
     assert found.kind == kind
     # 24 views with some 100 edgels each of 0.1 px: the mean is off by 0.01 px, but there are several unknowns
     assert off(found, true) < 0.05 * matching.pixel < 0.2 * matching.pixel < off(start, true)
 
 
-def test_corner_returns_and_stays_shared(taichi, generator):
+@either_errors()
+def test_corner_returns_and_stays_shared(taichi, generator, errors):
     true = corner(CORNERS)
-    matching = EdgelMatching(views_of([curve_of(shape) for shape in true.shapes], generator, noise_px=0.1))
+    matching = EdgelMatching(
+        views_of([curve_of(shape) for shape in true.shapes], generator, noise_px=0.1, errors=errors)
+    )
     start = CORNERS + 0.6 * matching.pixel * generator.uniform(-1, 1, CORNERS.shape)
     found = adjusted(corner(start), matching)
     assert np.linalg.norm(found.vertices[0] - CORNERS[0]) < 0.1 * matching.pixel
@@ -138,15 +138,19 @@ def test_corner_returns_and_stays_shared(taichi, generator):
         np.testing.assert_array_equal(edge.shape.ends, found.vertices[list(edge.vertices)])
 
 
-def test_hidden_views_do_not_matter(taichi, generator):
+@either_errors("more than 0.05 px off in 12 of 40 draws")
+def test_hidden_views_do_not_matter(taichi, generator, errors):
     true = corner(CORNERS)
-    matching = EdgelMatching(views_of([curve_of(s) for s in true.shapes], generator, noise_px=0.05, hidden=0.6))
+    matching = EdgelMatching(
+        views_of([curve_of(s) for s in true.shapes], generator, noise_px=0.05, hidden=0.6, errors=errors)
+    )
     found = adjusted(corner(CORNERS + 0.4 * matching.pixel * generator.uniform(-1, 1, CORNERS.shape)), matching)
     assert all(off(*pair) < 0.05 * matching.pixel for pair in zip(found.shapes, true.shapes))
 
 
-def test_free_end_does_not_slide(taichi, generator):
-    matching = EdgelMatching(views_of([line(*CORNERS[:2])], generator, noise_px=0.1))
+@either_errors()
+def test_free_end_does_not_slide(taichi, generator, errors):
+    matching = EdgelMatching(views_of([line(*CORNERS[:2])], generator, noise_px=0.1, errors=errors))
     start = Line(CORNERS[:2] + 0.3 * matching.pixel * generator.uniform(-1, 1, (2, 3)))
     found = adjusted(Wireframe.loose([start]), matching).edges[0].shape
     assert np.abs((found.ends - start.ends) @ start.tangents(0.5)).max() < 0.02 * matching.pixel
@@ -160,10 +164,11 @@ def test_edge_without_edgels_stays(taichi, generator):
     np.testing.assert_allclose(found.shapes[2].centre, CIRCLE.centre, atol=1e-4)
 
 
-def test_smooth_joint_stays_smooth(taichi, generator):
+@either_errors("up to 0.13 px off where 0.06 are asked, in 11 of 40 draws")
+def test_smooth_joint_stays_smooth(taichi, generator, errors):
     straight = Line(np.stack([ARC.ends[1], ARC.ends[1] + 0.2 * ARC.tangents(1.0)]))
     curves = [curve_of(ARC), curve_of(straight)]
-    matching = EdgelMatching(views_of(curves, generator, noise_px=0.1))
+    matching = EdgelMatching(views_of(curves, generator, noise_px=0.1, errors=errors))
     vertices = np.stack([*ARC.ends, straight.ends[1]])
     true = Wireframe(vertices, (Edge(ARC, (0, 1)), Edge(straight, (1, 2))), np.zeros((0, 2), np.int64))
     start = with_vertices(true, vertices + 0.5 * matching.pixel * generator.uniform(-1, 1, (3, 3)))
@@ -174,12 +179,13 @@ def test_smooth_joint_stays_smooth(taichi, generator):
     np.testing.assert_allclose(arc.ends[1], on.ends[0], atol=1e-12)
 
 
+@either_errors("up to 0.09 px off where 0.06 are asked, in 2 to 6 of 40 draws")
 @pytest.mark.parametrize("kind", ["line", "arc", "circle", "spline"])
-def test_touching_vertex_is_exactly_on_the_edge(taichi, generator, kind):
+def test_touching_vertex_is_exactly_on_the_edge(taichi, generator, kind, errors):
     touched = SHAPES[kind]
     place = touched.at(np.array([0.4]))[0]
     stem = Line(np.stack([place, place + [0.05, 0.1, -0.15]]))
-    matching = EdgelMatching(views_of([curve_of(touched), curve_of(stem)], generator, noise_px=0.1))
+    matching = EdgelMatching(views_of([curve_of(touched), curve_of(stem)], generator, noise_px=0.1, errors=errors))
     loose = Wireframe.loose([disturbed(stem, 0.3 * matching.pixel, generator), touched])
     found = adjusted(replace(loose, contacts=np.array([[0, 1]])), matching)
     vertex, other = found.vertices[0], found.shapes[1]

@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from edgel_scenes import SIZE, blank_views, line, pixel_of, views_of
+from edgel_scenes import SIZE, blank_views, edgel_errors, either_errors, line, pixel_of, views_of
 
 from taichi_edges.evidence.edgel_matching import EdgelMatching
 from taichi_edges.geometry.shapes import Line
@@ -19,11 +19,6 @@ VIEWS, FOCAL, DISTANCE = 9, 400.0, 1.1
 WALL = 0.6  # z of the façade, which spans x and y
 NOISE_PX = 0.15
 SEEDS = range(3)
-
-
-@pytest.fixture
-def taichi(start_taichi):
-    start_taichi("f32", 2)
 
 
 def walk():
@@ -47,11 +42,11 @@ def windows(generator):
     return np.array(upright), np.array(level)
 
 
-def facade(generator, *more, noise_px=NOISE_PX):
+def facade(generator, *more, errors="white"):
     """Views of the windows and (n, 2, 3) more lines; shapes of the verticals; ends of the horizontals."""
     upright, level = windows(generator)
     curves = [line(*ends) for ends in (*upright, *level, *more)]
-    views = views_of(curves, generator, noise_px=noise_px, cameras=walk(), count=VIEWS)
+    views = views_of(curves, generator, noise_px=NOISE_PX, cameras=walk(), count=VIEWS, errors=errors)
     return views, [Line(ends) for ends in upright], level
 
 
@@ -68,39 +63,43 @@ def matched(found, level, pixel):
     return np.where(near.any(axis=1), near.argmax(axis=1), -1)
 
 
+@either_errors()
 @pytest.mark.parametrize("seed", SEEDS)
-def test_horizontals_get_the_depth_of_the_verticals(taichi, generator, seed):
-    views, upright, level = facade(generator)
+def test_horizontals_get_the_depth_of_the_verticals(taichi, generator, seed, errors):
+    views, upright, level = facade(generator, errors=errors)
     found = matched(ends_of(anchored_lines(EdgelMatching(views), upright)), level, pixel_of(views))
     assert Counter(found.tolist()) == Counter(range(len(level)))
 
 
+@either_errors()
 @pytest.mark.parametrize("seed", SEEDS)
-def test_pipe_in_front_of_the_wall_pulls_nothing(taichi, generator, seed):
+def test_pipe_in_front_of_the_wall_pulls_nothing(taichi, generator, seed, errors):
     x = generator.uniform(0.4, 0.6)
     pipe = np.array([[(x, 0.1, WALL - 0.15), (x, 0.9, WALL - 0.15)]])
-    views, upright, level = facade(generator, *pipe)
+    views, upright, level = facade(generator, *pipe, errors=errors)
     found = anchored_lines(EdgelMatching(views), [*upright, Line(pipe[0])])
     found = matched(ends_of(found), level, pixel_of(views))
     assert Counter(found.tolist()) == Counter(range(len(level)))
 
 
-def test_what_hangs_on_anchored_lines_is_found_after_them(taichi, generator):
+@either_errors()
+def test_what_hangs_on_anchored_lines_is_found_after_them(taichi, generator, errors):
     """A bar in the middle of a window meets nothing but the lintel and the sill."""
     _, level = windows(np.random.default_rng(0))
     upright, _ = windows(np.random.default_rng(0))
     bars = level.mean(axis=1).reshape(-1, 2, 3)
     curves = [line(*ends) for ends in (*upright, *level, *bars)]
-    matching = EdgelMatching(views_of(curves, generator, NOISE_PX, cameras=walk(), count=VIEWS))
+    matching = EdgelMatching(views_of(curves, generator, NOISE_PX, cameras=walk(), count=VIEWS, errors=errors))
     found = anchored_lines(matching, [Line(ends) for ends in upright])
     ends, expected = np.array([each.points for each in found]), np.concatenate([level, bars])
     apart = np.minimum(*(np.abs(each[:, None] - expected).max(axis=(2, 3)) for each in (ends, ends[:, ::-1])))
     assert len(found) == len(expected) and apart.min(axis=0).max() <= 4 * matching.pixel
 
 
-def test_nothing_is_found_where_there_are_no_edgels(taichi, generator):
+@either_errors()
+def test_nothing_is_found_where_there_are_no_edgels(taichi, generator, errors):
     upright, _ = windows(generator)
-    views = views_of([line(*ends) for ends in upright], generator, NOISE_PX, cameras=walk(), count=VIEWS)
+    views = views_of([line(*ends) for ends in upright], generator, NOISE_PX, cameras=walk(), count=VIEWS, errors=errors)
     assert anchored_lines(EdgelMatching(views), [Line(ends) for ends in upright]) == []
     blank = blank_views(VIEWS, walk())
     views = views_of([], generator, cameras=walk(), count=VIEWS)
@@ -121,10 +120,11 @@ def strokes(generator, count):
     return points[inside], normals[inside], np.ones(inside.sum())
 
 
+@either_errors()
 @pytest.mark.parametrize("seed", SEEDS)
-def test_texture_that_differs_from_view_to_view_is_no_edge(taichi, generator, seed):
+def test_texture_that_differs_from_view_to_view_is_no_edge(taichi, generator, seed, errors):
     upright, _ = windows(generator)
-    views = views_of([line(*ends) for ends in upright], generator, NOISE_PX, cameras=walk(), count=VIEWS)
+    views = views_of([line(*ends) for ends in upright], generator, NOISE_PX, cameras=walk(), count=VIEWS, errors=errors)
     mixed = []
     for view in range(VIEWS):
         pairs = zip(views.edgels.of_view(view), strokes(generator, 150), strict=True)
@@ -133,8 +133,9 @@ def test_texture_that_differs_from_view_to_view_is_no_edge(taichi, generator, se
     assert len(anchored_lines(EdgelMatching(views), [Line(ends) for ends in upright])) <= 1
 
 
-def test_frames_close_and_keep_their_depth_in_the_wireframe(taichi, generator):
-    views, upright, level = facade(generator)
+@either_errors()
+def test_frames_close_and_keep_their_depth_in_the_wireframe(taichi, generator, errors):
+    views, upright, level = facade(generator, errors=errors)
     wireframe, counts = refine_wireframe(Wireframe.loose(upright), views, RefineConfig(enabled=True, anchor=True))
     found = matched(ends_of([shape for shape in wireframe.shapes[len(upright) :]]), level, pixel_of(views))
     assert counts.anchored == len(level) and sorted(found.tolist()) == list(range(len(level)))
@@ -147,18 +148,21 @@ def test_without_the_key_nothing_is_anchored(taichi, generator):
     assert counts.anchored == 0 and len(wireframe) == len(upright)
 
 
-def run_of(start, end, generator):
+def run_of(start, end, generator, errors):
     """Edgels of a straight 2D stroke: points and normals (n, 2), a pixel apart."""
     start, end = np.array(start, float), np.array(end, float)
     along = (end - start) / np.linalg.norm(end - start)
     normals = np.tile([-along[1], along[0]], (int(np.linalg.norm(end - start)) + 1, 1))
     points = start + np.arange(len(normals))[:, None] * along
-    return points + NOISE_PX * normals * generator.normal(size=(len(normals), 1)), normals
+    return points + NOISE_PX * normals * edgel_errors(points, generator, errors)[:, None], normals
 
 
-def test_runs_are_cut_at_bends_and_joined_over_gaps(generator):
+@either_errors()
+def test_runs_are_cut_at_bends_and_joined_over_gaps(generator, errors):
     parts = [((20, 20), (80, 30)), ((81.5, 31), (120, 70)), ((20, 100), (60, 100)), ((68, 100), (110, 100))]
-    points, normals = map(np.concatenate, zip(*(run_of(*part, generator) for part in parts), strict=True))
+    points, normals = map(
+        np.concatenate, zip(*(run_of(*part, generator, errors=errors) for part in parts), strict=True)
+    )
     found = straight_runs(points, normals)
     found = np.array([ends[np.argsort(ends[:, 0])] for ends in found[np.argsort(found[:, 0, 1])]])
     expected = [[(20, 20), (80, 30)], [(81.5, 31), (120, 70)], [(20, 100), (110, 100)]]

@@ -1,6 +1,5 @@
 """The benchmarks run to their end at tiny sizes and print plausible rows. How fast anything is, is not tested."""
 
-import os
 import shutil
 import subprocess
 import sys
@@ -35,19 +34,12 @@ fit: {line_tolerance: 0.1}
 """
 
 
-@pytest.fixture(scope="module")
-def run(pytestconfig):
-    """run(*command) -> what `python <command>` prints, run from the root of the project."""
-    cache = pytestconfig.cache.mkdir("benchmarks")
-
-    def run_one(*arguments):
-        command = [sys.executable, *map(str, arguments)]
-        environment = {**os.environ, "XDG_CACHE_HOME": str(cache)}
-        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=300)
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    return run_one
+def run(*arguments):
+    """What `python <arguments>` prints, run from the root of the project."""
+    command = [sys.executable, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def read_tables(text):
@@ -68,7 +60,8 @@ def read_tables(text):
 # The scripts --------------------------------------------------------------------------------------------------------
 
 
-def test_splat_prints_parts_and_ratios(run):
+@pytest.mark.slow(reason="runs a benchmark")
+def test_splat_prints_parts_and_ratios():
     text = run("benchmarks/splat.py", "--sizes", 300, 500, "--size", 200, "--repeats", 2, "--threads", 2)
     assert "Taichi" in text.splitlines()[0]
     steps, ratios = read_tables(text)
@@ -85,7 +78,8 @@ def test_splat_prints_parts_and_ratios(run):
             assert float(row["forward / C"]) > 0 and float(row["backward / C"]) > 0
 
 
-def test_pipeline_prints_stages_and_metrics(run, tmp_path):
+@pytest.mark.slow(reason="runs a benchmark")
+def test_pipeline_prints_stages_and_metrics(tmp_path):
     scene, lost = tmp_path / "tiny.yaml", tmp_path / "lost.yaml"
     scene.write_text(SCENE + "evaluation: {held_out: 1}\n")
     lost.write_text("source: {path: /nowhere/at/all}\n")
@@ -102,7 +96,8 @@ def test_pipeline_prints_stages_and_metrics(run, tmp_path):
     assert "Skipped lost: source.path: /nowhere/at/all does not exist" in text
 
 
-def test_scaling_prints_points_and_draws(run, tmp_path):
+@pytest.mark.slow(reason="runs a benchmark")
+def test_scaling_prints_points_and_draws(tmp_path):
     picture = tmp_path / "curves.png"
     base = ("--base", 300, 4, 96, "--large", 4, 96, 96, "--repeats", 1, "--threads", 2, "--out", picture)
     text = run("benchmarks/scaling.py", "--gaussians", 300, 600, "--views", 4, "--sizes", 96, *base)
@@ -120,7 +115,8 @@ def test_scaling_prints_points_and_draws(run, tmp_path):
     assert cv2.imread(str(picture)).std() > 5
 
 
-def test_scale_prints_steps_and_exponents(run):
+@pytest.mark.slow(reason="runs a benchmark")
+def test_scale_prints_steps_and_exponents():
     text = run("benchmarks/scale.py", "--copies", 1, 2, "--windows", 1, "--threads", 2)
     rows, exponents = read_tables(text)
     assert [row["step"] for row in rows] == 2 * ["cluster", "fit", "refine"]
@@ -129,10 +125,11 @@ def test_scale_prints_steps_and_exponents(run):
     assert [row["step"] for row in exponents] == ["cluster", "fit", "refine"]
 
 
-def test_scripts_are_modules_too(run):
+def test_scripts_are_modules_too():
     assert "usage: python benchmarks/splat.py" in run("-m", "benchmarks.splat", "--help")
 
 
+@pytest.mark.slow(reason="runs a benchmark")
 def test_wireframe_adds_step_by_step_what_the_stages_do(tmp_path, capsys):
     scene = tmp_path / "tiny.yaml"
     scene.write_text("source: {reader: synthetic, part: block, views: 12, size: 120, detector: subpixel}\n")

@@ -151,6 +151,7 @@ def rough_chain(generator, count):
     return chain
 
 
+@pytest.mark.slow(reason="has a slow twin")
 @pytest.mark.parametrize("block", [1, 100, 1 << 13])
 def test_costs_of_all_stretches_match_those_of_one_at_a_time(generator, monkeypatch, block):
     monkeypatch.setattr(segmentation, "BLOCK", block)

@@ -141,6 +141,7 @@ def true_errors(part, edgels):
     return np.concatenate(errors)
 
 
+@pytest.mark.slow(reason="calibrates many views")
 @pytest.mark.parametrize("width", [2.4, 4.5])
 @pytest.mark.parametrize("images", [True, False])
 def test_planted_shift_and_offset_are_found_and_corrected(part, generator, images, width):
@@ -247,6 +248,7 @@ def unbiased(name, generator, views=12, size=300, smooth=0):
     return found, trace_ridges(maps, Imperfections().width_px, 0.3), points, directions
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_chance_pairs_between_thin_bars_are_no_bias(generator):
     # Bars of 3 px, whose lines blend: nearly all points have one or two edgels, with which they agree to nothing.
     views, edgels, *seeds = unbiased("frame", generator)
@@ -294,6 +296,7 @@ def test_maps_without_edges_are_no_problem(part, generator):
     assert len(corrected) == 0 and found.reason and not found.shift_applied
 
 
+@pytest.mark.slow(reason="calibrates many views")
 @pytest.mark.parametrize("images", [True, False])
 def test_neither_threads_nor_the_order_of_the_points_matter(part, generator, images):
     views, edgels = planted(part, SHIFT, OFFSET, images=images)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from edgel_scenes import edgel_errors, either_errors
 
 from taichi_edges.detectors.chains import SURE_PX, chain_labels, chain_lengths, with_chain_strengths
 from taichi_edges.views.edgels import Edgels
@@ -16,13 +17,13 @@ def kept_of(edgels, least):
     return found.keep(lengths >= least)
 
 
-def run_of(start, angle, count, noise=0.0, generator=None):
+def run_of(start, angle, count, noise=0.0, generator=None, errors="white"):
     """Points (n, 2) a pixel apart on a straight line, and their normals (n, 2). angle: degrees, of the line."""
     along = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
     normal = np.array([-along[1], along[0]])
     points = np.asarray(start, float) + np.arange(count)[:, None] * along
     if noise:
-        points = points + generator.normal(0, noise, (count, 1)) * normal
+        points = points + noise * edgel_errors(points, generator, errors)[:, None] * normal
     return points, np.tile(normal, (count, 1))
 
 
@@ -35,8 +36,12 @@ def view_of(*runs, strength=0.5):
 NOTHING = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
 
 
-def test_a_chain_is_as_long_as_its_edge(generator):
-    runs = run_of([20, 20], 0, 60, NOISE_PX, generator), run_of([20, 60], 37, 25, NOISE_PX, generator)
+@either_errors()
+def test_a_chain_is_as_long_as_its_edge(generator, errors):
+    runs = (
+        run_of([20, 20], 0, 60, NOISE_PX, generator, errors=errors),
+        run_of([20, 60], 37, 25, NOISE_PX, generator, errors=errors),
+    )
     edgels = Edgels.of_views([view_of(*runs), NOTHING, view_of(runs[1])])
     assert chain_lengths(edgels).tolist() == [60] * 60 + [25] * 25 + [25] * 25
     labels = chain_labels(edgels)
@@ -85,13 +90,12 @@ def test_no_edgels():
         assert chain_labels(Edgels.of_views(views)).shape == chain_lengths(Edgels.of_views(views)).shape == (0,)
 
 
-@pytest.fixture
-def taichi(start_taichi):
-    start_taichi("f32", 2)
-
-
-def test_long_chains_are_kept_in_order_and_are_surer(taichi, generator):
-    long, short = run_of([20, 20], 20, 60, NOISE_PX, generator), run_of([20, 120], 0, 8, NOISE_PX, generator)
+@either_errors()
+def test_long_chains_are_kept_in_order_and_are_surer(taichi, generator, errors):
+    long, short = (
+        run_of([20, 20], 20, 60, NOISE_PX, generator, errors=errors),
+        run_of([20, 120], 0, 8, NOISE_PX, generator, errors=errors),
+    )
     points, normals, strengths = view_of(long, short, strength=0.3)
     shuffled = generator.permutation(len(points))
     first = points[shuffled], normals[shuffled], strengths[shuffled]
@@ -118,6 +122,7 @@ def test_nothing_is_left_of_nothing_and_of_texture(taichi):
         assert len(found) == 0 and found.view_count == len(views)
 
 
+@pytest.mark.slow(reason="starts Taichi anew")
 def test_chains_are_the_same_whichever_threads_and_run(start_taichi, generator):
     runs = [
         run_of(generator.uniform(20, 150, 2), generator.uniform(0, 180), 40, NOISE_PX, generator) for _ in range(20)

@@ -313,6 +313,7 @@ def part_project(tmp_path_factory):
     return folder, part, into_colmap
 
 
+@pytest.mark.slow(reason="runs the corridor")
 def test_edges_come_out_in_the_frame_and_scale_of_colmap(part_project, tmp_path):
     folder, part, into_colmap = part_project
     told = Told()

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from edgel_scenes import views_of
+from edgel_scenes import either_errors, views_of
 
 from taichi_edges.evidence.edgel_matching import EdgelMatching
 from taichi_edges.geometry.shapes import Line
@@ -12,11 +12,6 @@ from taichi_edges.refinement.completion import LONGEST_PX, MOST_PAIRS, clear_pla
 NEAR, FAR = np.array([[0.4, 0.4, 0.35], [0.48, 0.42, 0.35]]), np.array([[0.35, 0.7, 0.5], [0.55, 0.75, 0.45]])
 SEEDS = range(2)
 VIEWS = 16
-
-
-@pytest.fixture
-def taichi(start_taichi):
-    start_taichi("f32", 2)
 
 
 def turned(points, generator):
@@ -47,66 +42,77 @@ def matching_of(shapes, generator, **settings):
     return EdgelMatching(views_of(curves, generator, noise_px=0.1, count=VIEWS, **settings))
 
 
+@either_errors()
 @pytest.mark.parametrize("seed", SEEDS)
-def test_missing_line_is_found(taichi, generator, seed):
+def test_missing_line_is_found(taichi, generator, seed, errors):
     wireframe, tips = bridge(generator)
-    found, count = completed(wireframe, matching_of([*wireframe.shapes, Line(tips)], generator))
+    found, count = completed(wireframe, matching_of([*wireframe.shapes, Line(tips)], generator, errors=errors))
     assert count == 1 and len(found) == len(wireframe) + 1
     assert set(found.edges[-1].vertices) == {0, 1}
     np.testing.assert_array_equal(found.edges[-1].shape.points, found.vertices[list(found.edges[-1].vertices)])
     np.testing.assert_array_equal(found.vertices, wireframe.vertices)
 
 
+@either_errors()
 @pytest.mark.parametrize("seed", SEEDS)
-def test_missing_lines_do_not_lie_on_each_other(taichi, generator, seed):
+def test_missing_lines_do_not_lie_on_each_other(taichi, generator, seed, errors):
     """The images show a line from tip to tip, and a third vertex lies on it: two lines meet there, and no third one."""
     wireframe, tips = bridge(generator)
     middle, far = tips.mean(axis=0), turned(np.array([[0.44, 0.6, 0.5], [0.47, 0.3, 0.6]]), generator)
     vertices = np.concatenate([wireframe.vertices, middle[None], far])
     stems = tuple(Edge(Line(vertices[[6, end]]), (6, end)) for end in (7, 8))
     wireframe = Wireframe(vertices, wireframe.edges + stems, wireframe.contacts)
-    found, _ = completed(wireframe, matching_of([*wireframe.shapes, Line(tips)], generator))
+    found, _ = completed(wireframe, matching_of([*wireframe.shapes, Line(tips)], generator, errors=errors))
     assert (0, 1) not in {tuple(sorted(edge.vertices)) for edge in found.edges}
 
 
+@either_errors()
 @pytest.mark.parametrize("hidden", [0.2, 0.4])
-def test_missing_line_may_be_hidden_in_some_views(taichi, generator, hidden):
+def test_missing_line_may_be_hidden_in_some_views(taichi, generator, hidden, errors):
     wireframe, tips = bridge(generator)
-    assert completed(wireframe, matching_of([*wireframe.shapes, Line(tips)], generator, hidden=hidden))[1] == 1
+    assert (
+        completed(wireframe, matching_of([*wireframe.shapes, Line(tips)], generator, hidden=hidden, errors=errors))[1]
+        == 1
+    )
 
 
+@either_errors()
 @pytest.mark.parametrize("seed", SEEDS)
-def test_nothing_is_added_where_the_images_show_nothing(taichi, generator, seed):
+def test_nothing_is_added_where_the_images_show_nothing(taichi, generator, seed, errors):
     wireframe, _ = bridge(generator)
-    assert completed(wireframe, matching_of(wireframe.shapes, generator))[1] == 0
+    assert completed(wireframe, matching_of(wireframe.shapes, generator, errors=errors))[1] == 0
 
 
-def test_half_a_line_is_none(taichi, generator):
+@either_errors()
+def test_half_a_line_is_none(taichi, generator, errors):
     wireframe, tips = bridge(generator)
     half = Line(np.array([tips[0], tips.mean(axis=0)]))
-    assert completed(wireframe, matching_of([*wireframe.shapes, half], generator))[1] == 0
+    assert completed(wireframe, matching_of([*wireframe.shapes, half], generator, errors=errors))[1] == 0
 
 
-def test_line_that_is_known_is_not_added_again(taichi, generator):
+@either_errors()
+def test_line_that_is_known_is_not_added_again(taichi, generator, errors):
     wireframe, tips = bridge(generator)
-    once, _ = completed(wireframe, matching_of([*wireframe.shapes, Line(tips)], generator))
-    assert completed(once, matching_of(once.shapes, generator))[1] == 0
+    once, _ = completed(wireframe, matching_of([*wireframe.shapes, Line(tips)], generator, errors=errors))
+    assert completed(once, matching_of(once.shapes, generator, errors=errors))[1] == 0
 
 
-def test_edge_in_the_way_owns_its_edgels(taichi, generator):
+@either_errors()
+def test_edge_in_the_way_owns_its_edgels(taichi, generator, errors):
     """A line through both tips that ends in neither."""
     wireframe, tips = bridge(generator)
     along = Line(Line(tips).at(np.array([-0.5, 1.5])))
-    matching = matching_of([*wireframe.shapes, along], generator)
+    matching = matching_of([*wireframe.shapes, along], generator, errors=errors)
     vertices = np.concatenate([wireframe.vertices, along.ends])
     edges = (*wireframe.edges, Edge(along, (6, 7)))
     assert completed(Wireframe(vertices, edges, wireframe.contacts), matching)[1] == 0
 
 
-def test_free_ends_are_not_completed(taichi, generator):
+@either_errors()
+def test_free_ends_are_not_completed(taichi, generator, errors):
     """Only vertices in which edges meet are known well enough."""
     wireframe, tips = bridge(generator)
-    matching = matching_of([*wireframe.shapes, Line(tips)], generator)
+    matching = matching_of([*wireframe.shapes, Line(tips)], generator, errors=errors)
     assert completed(wireframe.keep(np.array([True, True, True, False])), matching)[1] == 0
 
 

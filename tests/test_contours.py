@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from edgel_scenes import CylinderContour, arc, centre, line, pixel_of, tangents, views_of
+from edgel_scenes import CylinderContour, arc, centre, either_errors, line, pixel_of, tangents, views_of
 
 from taichi_edges.evidence.edgel_matching import EdgelMatching
 from taichi_edges.evidence.explaining import explain
@@ -21,9 +21,7 @@ NOISE_PX = 0.05  # of our own detector
 PIXEL = 0.0046  # of these views, unit-cube units
 
 
-@pytest.fixture(autouse=True)
-def taichi(start_taichi):
-    start_taichi("f32", 2)
+pytestmark = pytest.mark.usefixtures("taichi")
 
 
 def judged(views, curves, radii=(1.0,), moved=True):
@@ -42,10 +40,11 @@ def lines_on(contour, views, every):
     return [contour.seen_from(centre(views, view)) for view in range(0, len(views), every)]
 
 
+@either_errors()
 @pytest.mark.parametrize("radius_px", [6, 12, 26])
-def test_contours_are_no_edges_and_do_not_explain_each_other(generator, radius_px):
+def test_contours_are_no_edges_and_do_not_explain_each_other(generator, radius_px, errors):
     contour = CylinderContour([0.6, 0.5], radius_px * PIXEL, 0.2, 0.8)
-    views = views_of([A, RIM, contour], generator, noise_px=NOISE_PX)
+    views = views_of([A, RIM, contour], generator, noise_px=NOISE_PX, errors=errors)
     assert pixel_of(views) == pytest.approx(PIXEL, rel=0.01)
     edges = judged(views, [A, RIM, *lines_on(contour, views, every=3)], radii=(3.0, 2.0, 1.0))
     assert edges[:2].all()
@@ -61,24 +60,27 @@ class Rounding(CylinderContour):
         return super().seen_from(camera) if np.abs(bearing) < np.radians(60) else elsewhere
 
 
-def test_an_edge_rounded_by_less_than_a_pixel_is_an_edge(generator):
+@either_errors()
+def test_an_edge_rounded_by_less_than_a_pixel_is_an_edge(generator, errors):
     """Its contour moves by 0.9 px (1 - cos 60 degrees), less than half a pixel, half of it to either side."""
     rounded = Rounding([0.6, 0.5], 0.9 * PIXEL, 0.2, 0.8)
-    views = views_of([A, RIM, rounded], generator, noise_px=NOISE_PX, count=48)
+    views = views_of([A, RIM, rounded], generator, noise_px=NOISE_PX, count=48, errors=errors)
     middle = line([0.6, 0.5 + 0.9 * PIXEL, 0.2], [0.6, 0.5 + 0.9 * PIXEL, 0.8])
     assert judged(views, [A, RIM, middle], radii=(2.0, 1.0, 1.0)).all()
 
 
-def test_close_parallel_edges_stay(generator):
+@either_errors()
+def test_close_parallel_edges_stay(generator, errors):
     """2 pixels apart, each hidden in a third of the views, in which the edgels of the other are all there is."""
     pair = [line([0.2, y, 0.5], [0.8, y, 0.5]) for y in (0.5, 0.5 + 2 * PIXEL)]
-    views = views_of([*pair, RIM], generator, noise_px=NOISE_PX, hidden=0.33)
+    views = views_of([*pair, RIM], generator, noise_px=NOISE_PX, hidden=0.33, errors=errors)
     assert judged(views, [*pair, RIM]).all()
 
 
-def test_a_line_whose_edgels_others_explain_is_none(generator):
+@either_errors()
+def test_a_line_whose_edgels_others_explain_is_none(generator, errors):
     """A second line 2/3 of a pixel beside an edge lies on the edgels of that one only."""
-    views = views_of([A, RIM], generator, noise_px=NOISE_PX)
+    views = views_of([A, RIM], generator, noise_px=NOISE_PX, errors=errors)
     beside = line(np.array([0.2, 0.3, 0.303]), np.array([0.8, 0.35, 0.403]))
     np.testing.assert_array_equal(judged(views, [A, beside, RIM], moved=False), [True, False, True])
 
@@ -94,9 +96,10 @@ def test_evidence_grows_with_the_share_and_with_the_views():
     assert likelihood_ratio(2, 2, usual) == pytest.approx(-2 * np.log(usual), rel=1e-3)
 
 
-def test_clusters_are_left_without_contours(generator):
+@either_errors()
+def test_clusters_are_left_without_contours(generator, errors):
     contour = CylinderContour([0.6, 0.5], 12 * PIXEL, 0.2, 0.8)
-    views = views_of([A, contour], generator, noise_px=NOISE_PX)
+    views = views_of([A, contour], generator, noise_px=NOISE_PX, errors=errors)
     limb, s = lines_on(contour, views, every=24)[0], np.linspace(0.1, 0.9, 40)
     matching = EdgelMatching(views)
     found = refine_points(
@@ -113,6 +116,7 @@ def test_clusters_are_left_without_contours(generator):
     assert untouched is clusters and contours == 0
 
 
+@pytest.mark.slow(reason="starts Taichi anew")
 def test_the_result_does_not_depend_on_threads(start_taichi, generator):
     contour = CylinderContour([0.6, 0.5], 6 * PIXEL, 0.2, 0.8)
     views = views_of([A, RIM, contour], generator, noise_px=0.2, hidden=0.4)

@@ -62,6 +62,7 @@ def test_a_row_for_each_of_four_views(tmp_path, generator, count, rows):
     assert read(path).shape[:2] == expected_size(rows, 6, 300)
 
 
+@pytest.mark.slow(reason="draws large sheets")
 @pytest.mark.parametrize(
     "width, height, cell_height",
     [(64, 48, 300), (1600, 1200, 300), (300, 900, 480), (900, 100, 240), (3, 2, 267), (401, 299, 298)],

@@ -567,11 +567,6 @@ def points_on_column(count, column=16, depth=2.0):
     )
 
 
-@pytest.fixture
-def taichi(start_taichi):
-    start_taichi("f32", 2)
-
-
 def filtered(points, opacities=None, **config):
     """filter_points with directions that carry the points' numbers."""
     opacities = np.ones(len(points)) if opacities is None else opacities
@@ -631,6 +626,7 @@ def test_too_few_points_have_no_outliers(generator):
     np.testing.assert_array_equal(statistical_inliers(generator.random((5, 3)), 10, 1.0), np.arange(5))
 
 
+@pytest.mark.slow(reason="fits many pieces")
 @pytest.mark.parametrize("lobes", [6, 8])
 def test_a_rim_of_scallops_gets_the_pieces_it_needs_although_one_more_does_not_help(lobes):
     angles = np.linspace(0, 2 * np.pi, 400, endpoint=False)

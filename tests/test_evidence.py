@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from edgel_scenes import CylinderContour, arc, line, pixel_of, views_of
+from edgel_scenes import CylinderContour, arc, either_errors, line, pixel_of, views_of
 
 from taichi_edges.evidence.edge_support import (
     Claims,
@@ -23,11 +23,6 @@ START, END = np.array([0.2, 0.3, 0.3]), np.array([0.8, 0.35, 0.4])
 A = line(START, END)
 RIM = arc([0.5, 0.5, 0.6], 0.25)
 CIRCLE = EllipticArc(np.array([0.5, 0.5, 0.6]), 0.25 * np.eye(3)[:2], 0.0, 2 * np.pi)
-
-
-@pytest.fixture
-def taichi(start_taichi):
-    start_taichi("f32", 2)
 
 
 def matching_of(curves, generator, **settings):
@@ -72,9 +67,10 @@ def test_nearest_edge_owns_the_edgel():
     np.testing.assert_array_equal(claims.beside(1), [0.2, np.inf, 0.3, np.inf])
 
 
-def test_true_edges_are_confirmed(taichi, generator):
+@either_errors()
+def test_true_edges_are_confirmed(taichi, generator, errors):
     shapes = [Line(np.array([START, END])), CIRCLE]
-    found = supported(matching_of([A, RIM], generator, noise_px=0.1), shapes)
+    found = supported(matching_of([A, RIM], generator, noise_px=0.1, errors=errors), shapes)
     for shape, evidence in zip(shapes, found, strict=True):
         assert evidence.views == 24
         assert evidence.supported_length == pytest.approx(shape.length, rel=0.02)
@@ -82,20 +78,25 @@ def test_true_edges_are_confirmed(taichi, generator):
         assert evidence.confidence > 0.99
 
 
-def test_noise_is_measured(taichi, generator):
+@either_errors()
+def test_noise_is_measured(taichi, generator, errors):
     for noise in (0.05, 0.3):
-        support = support_of(matching_of([A, RIM], generator, noise_px=noise), [Line(np.array([START, END])), CIRCLE])
+        support = support_of(
+            matching_of([A, RIM], generator, noise_px=noise, errors=errors), [Line(np.array([START, END])), CIRCLE]
+        )
         assert 0.65 * noise < support.noise_px < 1.1 * noise  # a sample's edgel is the nearest of some
 
 
-def test_hidden_views_say_nothing_against_an_edge(taichi, generator):
-    half = matching_of([A, RIM], generator, noise_px=0.1, hidden=0.5)
+@either_errors()
+def test_hidden_views_say_nothing_against_an_edge(taichi, generator, errors):
+    half = matching_of([A, RIM], generator, noise_px=0.1, hidden=0.5, errors=errors)
     found = supported(half, [Line(np.array([START, END])), CIRCLE])
     assert all(evidence.confidence > 0.98 for evidence in found)
 
 
-def test_neighbour_does_not_support_an_edge(taichi, generator):
-    matching = matching_of([A], generator, noise_px=0.05)
+@either_errors()
+def test_neighbour_does_not_support_an_edge(taichi, generator, errors):
+    matching = matching_of([A], generator, noise_px=0.05, errors=errors)
     true = Line(np.array([START, END]))
     beside = moved(true, 0.6 * matching.pixel * np.array([0.0, 0.6, 0.8]))
     alone, (owner, neighbour) = supported(matching, [beside])[0], supported(matching, [true, beside])
@@ -104,10 +105,11 @@ def test_neighbour_does_not_support_an_edge(taichi, generator):
     assert neighbour.supported_length < 0.1 * beside.length and neighbour.confidence < 0.1
 
 
-def test_two_close_parallel_edges_are_both_confirmed(taichi, generator):
+@either_errors()
+def test_two_close_parallel_edges_are_both_confirmed(taichi, generator, errors):
     apart = np.array([0.0, 0.0, 0.012])  # 2 px of these views
     shapes = [Line(np.array([START, END])), Line(np.array([START, END]) + apart)]
-    matching = matching_of([A, line(START + apart, END + apart)], generator, noise_px=0.1)
+    matching = matching_of([A, line(START + apart, END + apart)], generator, noise_px=0.1, errors=errors)
     assert 1.0 < 0.012 / matching.pixel < 3.0
     assert all(evidence.confidence > 0.9 for evidence in supported(matching, shapes))
 
@@ -118,8 +120,9 @@ def test_two_views_confirm_nothing(taichi, generator):
     assert found.views == 2 and found.supported_length == 0 and found.confidence < 0.05
 
 
-def test_share_of_the_views_with_an_edge_in_the_image_that_support_it(taichi, generator):
-    views = views_of([A, RIM], generator, noise_px=0.05, count=10)
+@either_errors()
+def test_share_of_the_views_with_an_edge_in_the_image_that_support_it(taichi, generator, errors):
+    views = views_of([A, RIM], generator, noise_px=0.05, count=10, errors=errors)
     chosen = views.edgels.views < 3  # the others show nothing
     few = EdgelMatching(replace(views, edgels=views.edgels.keep(chosen)))
     shapes = [Line(np.array([START, END])), CIRCLE]
@@ -143,15 +146,17 @@ def test_contour_is_not_sure(taichi, generator):
     assert found[0].confidence < 0.3 < 0.98 < found[1].confidence
 
 
-def test_support_ends_where_the_edge_ends(taichi, generator):
-    matching = matching_of([A], generator, noise_px=0.05)
+@either_errors()
+def test_support_ends_where_the_edge_ends(taichi, generator, errors):
+    matching = matching_of([A], generator, noise_px=0.05, errors=errors)
     short = Line(A(np.array([0.2, 0.6])))
     views = support_along(matching, short, np.array([-0.8, -0.3, 0.5, 1.5, 2.2]), claims_of(matching, [short]), own=0)
     assert (views[1:4] > 20).all() and (views[[0, 4]] == 0).all()
 
 
-def test_what_others_own_supports_no_extension(taichi, generator):
-    matching = matching_of([A], generator, noise_px=0.05)
+@either_errors()
+def test_what_others_own_supports_no_extension(taichi, generator, errors):
+    matching = matching_of([A], generator, noise_px=0.05, errors=errors)
     first, second = Line(A(np.array([0.0, 0.4]))), Line(A(np.array([0.6, 1.0])))
     claims = claims_of(matching, [first, second])
     views = support_along(matching, first, np.array([0.5, 1.25, 2.0]), claims, own=0)

@@ -32,8 +32,9 @@ from taichi_edges.progress import Progress
 from taichi_edges.splatting.gaussians import start_gaussians
 from taichi_edges.splatting.training import Training
 from taichi_edges.synthetic.parts import PARTS
-from taichi_edges.synthetic.rendering import Imperfections, render_views
 from taichi_edges.synthetic.visibility import sample_edges
+
+pytestmark = pytest.mark.slow(reason="builds the kernels of every device and schedule")
 
 DEVICES = {"cpu-f64": ("cpu", "f64"), "cpu-f32": ("cpu", "f32"), "vulkan": ("vulkan", "f32"), "cuda": ("cuda", "f32")}
 WIDTH, HEIGHT = 50, 40
@@ -315,11 +316,10 @@ def test_gaussians_grow_beyond_the_capacity(results):
 
 
 @pytest.fixture(scope="module")
-def trained(start_taichi, seed):
+def trained(start_taichi, clean_block, seed):
     """trained(arch, schedule) -> Gaussians, losses of the view steps and log records of a short run in f32."""
-    part = PARTS["block"]()
-    views, _ = render_views(part, 12, 96, Imperfections.none(), np.random.default_rng(0))
-    edges = sample_edges(part, 0.002).points
+    views, _ = clean_block(12, 96)
+    edges = sample_edges(PARTS["block"](), 0.002).points
     generator = np.random.default_rng(seed)
     on = edges[generator.choice(len(edges), 500, replace=False)] + generator.normal(size=(500, 3)) * PIXEL / 2
     start = start_gaussians(np.concatenate([on, generator.random((200, 3))]), generator, 0.01, 0.08)

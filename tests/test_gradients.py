@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from autodiff_splatting import AutodiffSplat
+from autodiff_splatting import autodiff_of
 from gradient_checks import assert_gradients, gradients, random_neighbors
 from reference_splatting import (
     INSIDE,
@@ -48,11 +48,12 @@ def test_gradients_of_the_image_loss(open_splatter, seed, generator, view, large
     splatter.load(gaussians)
     splatter.select_pixels(view, 1)
     pixels = selected(splatter)
-    splatter.record() if record == "hand adjoint" else AutodiffSplat(splatter).record()
+    splatter.record() if record == "hand adjoint" else autodiff_of(splatter).record()
     expected = gradient(lambda moved: image_loss(moved, scene.camera(view), *pixels), gaussians)
     assert_gradients(gradients(splatter), expected, TOLERANCE["f64"])
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 @pytest.mark.parametrize("record", ["hand adjoint", "Taichi's own"])
 def test_gradients_of_the_loss_with_weights_and_flanks(open_splatter, seed, generator, record):
     scene, gaussians = random_scene(seed, WIDTH, HEIGHT), random_gaussians(25, generator)
@@ -64,7 +65,7 @@ def test_gradients_of_the_loss_with_weights_and_flanks(open_splatter, seed, gene
         pixels = selected(splatter)
         assert len(np.unique(pixels[1])) > 10, "many weights"
         splatter.load(gaussians)
-        splatter.record() if record == "hand adjoint" else AutodiffSplat(splatter).record()
+        splatter.record() if record == "hand adjoint" else autodiff_of(splatter).record()
         expected = gradient(lambda moved: image_loss(moved, scene.camera(view), *pixels), gaussians)
         assert_gradients(gradients(splatter), expected, TOLERANCE["f64"])
 
@@ -74,7 +75,7 @@ def test_hand_adjoint_equals_taichis_own(open_splatter, seed, generator, view):
     splatter = open_splatter(random_scene(seed, WIDTH, HEIGHT))
     gaussians = random_gaussians(600, generator)
     results = []
-    for record in (splatter.record, AutodiffSplat(splatter).record):
+    for record in (splatter.record, autodiff_of(splatter).record):
         splatter.load(gaussians)
         splatter.select_pixels(view, 2)
         plain = record()
@@ -85,6 +86,7 @@ def test_hand_adjoint_equals_taichis_own(open_splatter, seed, generator, view):
     assert_gradients(results[0][1], results[1][1], 1e-10)
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 @pytest.mark.parametrize(
     "real, count", [("f64", 1), ("f64", 512), ("f64", 513), ("f64", 1025), ("f32", 513), ("f32", 1025)]
 )
@@ -263,6 +265,7 @@ def test_adam_is_adam(open_splatter, seed, generator):
         np.testing.assert_allclose(moments, flat, rtol=1e-12, atol=1e-18)
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 def test_two_runs_with_one_seed_are_equal_to_the_last_bit(open_splatter, seed, generator):
     splatter = open_splatter(random_scene(seed, WIDTH, HEIGHT), "f32", threads=2)
     gaussians, neighbors = random_gaussians(1500, generator), random_neighbors(1500, generator)

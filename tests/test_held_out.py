@@ -91,6 +91,7 @@ def test_a_split_keeps_every_view_and_its_edgels_on_one_side(generator):
         assert len(all_of_them) == 5 and len(none) == 0
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_what_is_held_out_is_corrected_for_biases_found_elsewhere(tmp_path):
     """Both files have their edgels moved by the same shift, and maps drawn through them."""
     source = {"reader": "synthetic", "part": "block", "views": 8, "size": 128}
@@ -286,6 +287,7 @@ def f_score_in_space(polylines, truth):
     return point_metrics(average_per_voxel(points), truth.astype(np.float32))["f_score_5mm_percent"]
 
 
+@pytest.mark.slow(reason="scores many variants")
 def test_held_out_views_rank_results_as_the_distances_to_the_true_edges_do(bracket):
     part, training, held_out = bracket
     truth = middle_samples(exact_polylines(part.edges), 0.0005)[0]

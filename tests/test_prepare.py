@@ -14,9 +14,6 @@ from taichi_edges.corridor.pipeline import Run
 from taichi_edges.errors import UserError
 from taichi_edges.progress import Progress
 from taichi_edges.scene.scene_file import check_scene
-from taichi_edges.synthetic.drawing import Imperfections
-from taichi_edges.synthetic.parts import PARTS
-from taichi_edges.synthetic.rendering import render_views
 from taichi_edges.views.cameras import invert_pose
 from taichi_edges.views.views import read_views
 
@@ -33,10 +30,10 @@ class Warnings(Progress):
         self.texts.append(text)
 
 
-@pytest.fixture(scope="module")
-def rendered():
+@pytest.fixture
+def rendered(clean_block):
     """Views of the block with clean edge maps, and pictures."""
-    return render_views(PARTS["block"](), VIEWS, SIZE, Imperfections.none(), np.random.default_rng(0))
+    return clean_block(VIEWS, SIZE)
 
 
 @pytest.fixture
@@ -94,6 +91,7 @@ def test_images_alone_are_enough(prepare, tmp_path, rendered):
         assert (views.edge_maps[view] >= 128).any()
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_named_edge_maps_go_before_images(prepare):
     facts, views, _ = prepare({"edges": "edge_test"})
     assert facts["detector"] == "maps" and facts["line_width_px"] > 1
@@ -136,6 +134,7 @@ def test_a_wrong_pose_is_named_before_edges_are_looked_for(prepare, folder, monk
     assert "v3" in refusal(prepare)
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_fixed_biases_are_taken_as_they_are(prepare):
     plain = prepare({"edges": "edge_test"}, calibration="off")
     moved = prepare({"edges": "edge_test"}, calibration={"shift": [0.5, -0.25], "silhouette": "off"})
@@ -198,6 +197,7 @@ def test_a_synthetic_scene_can_be_traced_in_its_own_pictures(tmp_path):
     assert (tmp_path / "truth.json").is_file()
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_lines_that_leave_the_image_when_they_are_moved_are_no_trouble(prepare, folder):
     for path in (folder / "edge_test").iterdir():
         edge_map = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -209,6 +209,7 @@ def test_lines_that_leave_the_image_when_they_are_moved_are_no_trouble(prepare, 
         assert facts["edgels"] == len(views.edgels) and (views.edge_maps >= 128).any()
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_a_calibration_where_there_is_none_is_refused(prepare):
     assert "our own detector has no bias" in refusal(prepare, calibration={"shift": [3, 3]})
     _, _, warnings = prepare({"edges": "edge_test", "thin": False}, calibration={"shift": [3, 3]})
@@ -221,6 +222,7 @@ def test_photographs_are_not_taken_for_edge_maps(prepare, folder):
     assert "px wide; are these photographs?" in refusal(prepare, {"edges": "edge_test"})
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_a_nerf_folder_of_photographs_needs_no_key_to_say_so(prepare, folder, tmp_path):
     content = json.loads((folder / "meta_data.json").read_text())
     flip = np.diag([1.0, -1, -1, 1])
@@ -246,6 +248,7 @@ def test_a_needless_calibration_is_refused_before_edges_are_looked_for(prepare, 
     assert "our own detector has no bias" in refusal(prepare, calibration={"silhouette": 1.3})
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_images_of_16_bits_calibrate_as_those_of_8_do(prepare, folder):
     known = {"edges": "edge_test"}
     shallow = prepare(known)[0]["calibration"]
@@ -254,6 +257,7 @@ def test_images_of_16_bits_calibrate_as_those_of_8_do(prepare, folder):
     assert prepare(known)[0]["calibration"] == shallow
 
 
+@pytest.mark.slow(reason="calibrates many views")
 @pytest.mark.parametrize("source", [{"edges": "edge_test"}, {"detector": "subpixel"}], ids=["calibrated", "subpixel"])
 def test_the_sheet_shows_what_the_training_gets(prepare, monkeypatch, source):
     shown = {}

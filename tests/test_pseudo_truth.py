@@ -128,6 +128,7 @@ def test_the_stage_scores_against_a_scan_in_the_frame_of_the_input(scanned, tmp_
     assert np.median(dense_curves(exact_polylines(part.edges)).distances(points)) < 0.003
 
 
+@pytest.mark.slow(reason="projects a scan")
 def test_a_scan_can_be_judged_by_other_maps_than_the_scenes(scanned, tmp_path):
     """The scene's own maps are blank; those of the folder that the scene names for the scan are not."""
     part, cameras, maps, scan = scanned

@@ -591,6 +591,7 @@ REAL = {
 }
 
 
+@pytest.mark.slow(reason="reads real scenes")
 @pytest.mark.parametrize("kind", REAL)
 def test_true_edges_of_the_real_scenes_fall_on_edge_pixels(kind):
     root = os.environ.get("TAICHI_EDGES_DATA")

@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from edgel_scenes import views_of
+from edgel_scenes import either_errors, views_of
 
 from taichi_edges.corridor.pipeline import Run
 from taichi_edges.corridor.refine import refine
@@ -23,15 +23,10 @@ ENABLED = RefineConfig(enabled=True)
 NOISE_PX, VIEWS = 0.1, 12  # of the edgels; half of the usual views, as each takes its time
 
 
-@pytest.fixture
-def taichi(start_taichi):
-    start_taichi("f32", 2)
-
-
 class Box:
     """A box with a round hole in its top, turned about the upright axis, the views of it, and strokes along it."""
 
-    def __init__(self, generator, hidden=0.2):
+    def __init__(self, generator, hidden=0.2, errors="white"):
         angle, unit = (
             generator.uniform(0, 2 * np.pi),
             np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]),
@@ -43,7 +38,7 @@ class Box:
         centre = np.array([*(0.5 * (LOW + HIGH))[:2], HIGH[2]])
         self.rim = EllipticArc((centre - 0.5) @ turn.T + 0.5, RADIUS * turn.T[:2], 0.0, 2 * np.pi)
         curves = [lambda s, shape=shape: shape.at(np.asarray(s)) for shape in (*self.lines, self.rim)]
-        self.views = views_of(curves, generator, noise_px=NOISE_PX, hidden=hidden, count=VIEWS)
+        self.views = views_of(curves, generator, noise_px=NOISE_PX, hidden=hidden, count=VIEWS, errors=errors)
         self.pixel = pixel_size(self.views)
 
     def strokes(self, generator):
@@ -77,9 +72,10 @@ def off(points, wanted):
     return np.linalg.norm(np.asarray(wanted)[:, None] - points, axis=2).min(axis=1).max()
 
 
+@either_errors()
 @pytest.mark.parametrize("seed", range(2))
-def test_strokes_along_a_box_with_a_hole_become_its_wireframe(taichi, generator, seed):
-    box = Box(generator)
+def test_strokes_along_a_box_with_a_hole_become_its_wireframe(taichi, generator, seed, errors):
+    box = Box(generator, errors=errors)
     found, counts = refine_wireframe(box.strokes(generator), box.views, ENABLED)
     assert kinds_of(found) == ["circle"] + ["line"] * 12
     assert len(found.vertices) == 8 and (found.degrees == 3).all() and len(found.contacts) == 0
@@ -106,16 +102,18 @@ def test_same_twice_bit_for_bit(taichi, generator):
         np.testing.assert_array_equal(polyline(a.shape), polyline(b.shape))
 
 
-def test_refined_twice_is_as_once(taichi, generator):
-    box = Box(generator)
+@either_errors()
+def test_refined_twice_is_as_once(taichi, generator, errors):
+    box = Box(generator, errors=errors)
     once, _ = refine_wireframe(box.strokes(generator), box.views, ENABLED)
     twice, counts = refine_wireframe(Wireframe.loose(once.shapes), box.views, ENABLED)
     assert replace(counts, relations={}) == RefineCounts()
     assert kinds_of(twice) == kinds_of(once) and off(twice.vertices, once.vertices) < 0.02 * box.pixel
 
 
-def test_edge_that_no_image_shows_is_removed_and_counted(taichi, generator):
-    box = Box(generator)
+@either_errors()
+def test_edge_that_no_image_shows_is_removed_and_counted(taichi, generator, errors):
+    box = Box(generator, errors=errors)
     ghost = Line(box.rim.centre + np.array([[-0.05, 0.02, 0.15], [0.1, 0.05, 0.2]]))
     loose = Wireframe.loose([*box.strokes(generator).shapes, ghost])
     found, counts = refine_wireframe(loose, box.views, ENABLED)
@@ -123,9 +121,10 @@ def test_edge_that_no_image_shows_is_removed_and_counted(taichi, generator):
     assert min(distances_to(shape, ghost.points).min() for shape in found.shapes) > 0.02
 
 
-def test_short_edge_that_nobody_found_is_added(taichi, generator):
+@either_errors()
+def test_short_edge_that_nobody_found_is_added(taichi, generator, errors):
     """The upright lines of a low box."""
-    box = Box(generator)
+    box = Box(generator, errors=errors)
     upright = [number for number, line in enumerate(box.lines) if abs(line.tangents(0.5)[2]) > 0.9]
     lines = [line for number, line in enumerate(box.lines) if number != upright[0]]
     loose = Wireframe.loose([box.disturbed(line, generator) for line in lines])

@@ -4,7 +4,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from edgel_scenes import views_of
+from edgel_scenes import either_errors, views_of
 
 from taichi_edges.evidence.edgel_matching import EdgelMatching
 from taichi_edges.geometry.shapes import EllipticArc, Line
@@ -14,11 +14,6 @@ from taichi_edges.refinement.regularities import KINDS, regularised
 
 TURN = np.linalg.qr(np.array([[0.8, 0.1, -0.2], [0.3, 0.9, 0.1], [0.1, -0.4, 0.7]]))[0]  # the box is aligned to nothing
 NOISE_PX = 0.15
-
-
-@pytest.fixture
-def taichi(start_taichi):
-    start_taichi("f32", 2)
 
 
 def box(lean=0.0):
@@ -38,10 +33,10 @@ def rims(radii, centres):
     return Wireframe.loose(shapes)
 
 
-def seen(wireframe, generator):
+def seen(wireframe, generator, errors="white"):
     """EdgelMatching of noisy views of a wireframe, and the wireframe as they show it."""
     curves = [lambda s, shape=shape: shape.at(np.asarray(s)) for shape in wireframe.shapes]
-    matching = EdgelMatching(views_of(curves, generator, noise_px=NOISE_PX, count=12))
+    matching = EdgelMatching(views_of(curves, generator, noise_px=NOISE_PX, count=12, errors=errors))
     return matching, adjusted(wireframe, matching)
 
 
@@ -59,9 +54,10 @@ def from_right(wireframe):
     return np.minimum(found, np.pi / 2 - found)
 
 
-def test_noisy_box_becomes_exactly_rectangular(taichi, generator):
+@either_errors("true right angles are refused in 20 of 40 draws")
+def test_noisy_box_becomes_exactly_rectangular(taichi, generator, errors):
     true = box()
-    matching, noisy = seen(true, generator)
+    matching, noisy = seen(true, generator, errors=errors)
     regular, counts = regularised(noisy, matching)
     assert from_right(noisy).max() > 1e-4
     assert from_right(regular).max() < 1e-6
@@ -74,9 +70,10 @@ def test_noisy_box_becomes_exactly_rectangular(taichi, generator):
     assert after < before
 
 
-def test_leaning_edge_is_left_alone(taichi, generator):
+@either_errors("0.1 degrees off, or true relations refused, in 8 of 40 draws")
+def test_leaning_edge_is_left_alone(taichi, generator, errors):
     true = box(lean=np.radians(2.0))
-    matching, noisy = seen(true, generator)
+    matching, noisy = seen(true, generator, errors=errors)
     regular, counts = regularised(noisy, matching)
     expected = from_right(true)
     np.testing.assert_allclose(from_right(regular), expected, atol=np.radians(0.1))
@@ -84,9 +81,10 @@ def test_leaning_edge_is_left_alone(taichi, generator):
     assert np.linalg.norm(regular.vertices - true.vertices, axis=1).max() < 0.1 * matching.pixel
 
 
-def test_equal_radii(taichi, generator):
+@either_errors("equal radii are refused in 3 of 40 draws")
+def test_equal_radii(taichi, generator, errors):
     true = rims((0.1, 0.1, 0.13), ([0.3, 0.3, 0.4], [0.7, 0.6, 0.4], [0.3, 0.7, 0.4]))
-    matching, noisy = seen(true, generator)
+    matching, noisy = seen(true, generator, errors=errors)
     regular, counts = regularised(noisy, matching)
     radii = [shape.radii.mean() for shape in regular.shapes]
     assert radii[0] == pytest.approx(radii[1], abs=1e-8) and radii[2] == pytest.approx(0.13, abs=1e-3)
@@ -97,17 +95,19 @@ def test_equal_radii(taichi, generator):
     assert np.ptp(heights) < 1e-8 and counts["coplanar"][0] == 2
 
 
-def test_radii_that_differ_stay_different(taichi, generator):
+@either_errors("they differ by 0.0025, not by 0.003 within 0.0005, in 1 of 40 draws")
+def test_radii_that_differ_stay_different(taichi, generator, errors):
     true = rims((0.1, 0.103), ([0.3, 0.3, 0.4], [0.7, 0.6, 0.4]))  # by half a pixel of these views
-    matching, noisy = seen(true, generator)
+    matching, noisy = seen(true, generator, errors=errors)
     regular, counts = regularised(noisy, matching)
     assert counts["equal_radius"] == (0, 0)
     assert np.diff([shape.radii.mean() for shape in regular.shapes]) == pytest.approx(0.003, abs=5e-4)
 
 
-def test_coaxial_rims(taichi, generator):
+@either_errors()
+def test_coaxial_rims(taichi, generator, errors):
     true = rims((0.1, 0.2), ([0.5, 0.5, 0.4], [0.5, 0.5, 0.6]))
-    matching, noisy = seen(true, generator)
+    matching, noisy = seen(true, generator, errors=errors)
     regular, counts = regularised(noisy, matching)
     first, second = regular.shapes
     assert counts["coaxial"] == (1, 1) and counts["coplanar"] == (0, 0)

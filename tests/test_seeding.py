@@ -30,8 +30,7 @@ def views(part):
 
 
 @pytest.fixture
-def seeds(start_taichi, views):
-    start_taichi("f32", 2)
+def seeds(taichi, views):
     return vote_seeds(views, 0.5, np.random.default_rng(0))
 
 
@@ -48,8 +47,7 @@ def test_seeds_cover_the_edges_and_few_lie_elsewhere(seeds, part):
     assert np.median(along[(to_truth < 2 * seeds.pixel) & ~corners]) > 0.95
 
 
-def test_the_same_generator_gives_the_same_seeds(start_taichi, views):
-    start_taichi("f32", 2)
+def test_the_same_generator_gives_the_same_seeds(taichi, views):
     one, other = (vote_seeds(views, 0.5, np.random.default_rng(7)) for _ in range(2))
     assert one.points.tobytes() == other.points.tobytes()
 
@@ -61,14 +59,13 @@ def test_of_too_many_seeds_some_are_drawn(start_taichi, views, seeds):
     np.testing.assert_array_equal(some.directions, seeds.directions[which])
 
 
-def test_maps_without_agreement_give_no_seeds(start_taichi, views):
-    start_taichi("f32", 2)
+def test_maps_without_agreement_give_no_seeds(taichi, views):
     blank = replace(views, edge_maps=np.zeros_like(views.edge_maps))
     assert len(vote_seeds(blank, 0.5, np.random.default_rng(0)).points) == 0
 
 
-def test_seeds_do_not_depend_on_batches_chunks_and_threads(start_taichi, views, monkeypatch):
-    start_taichi("f32", 2)
+@pytest.mark.slow(reason="starts Taichi anew")
+def test_seeds_do_not_depend_on_batches_chunks_and_threads(taichi, start_taichi, views, monkeypatch):
     expected = vote_seeds(views, 0.5, np.random.default_rng(0))
     monkeypatch.setattr(voting, "BATCH_BYTES", 7 * 200 * 200)
     monkeypatch.setattr(voting, "CHUNK", 5000)
@@ -92,8 +89,7 @@ def test_distances_are_exact_to_a_quarter_pixel(generator):
 
 
 @pytest.mark.parametrize("split", [0, 1])
-def test_cells_see_edges_as_those_of_the_slow_twin_do(start_taichi, views, generator, split):
-    start_taichi("f32", 2)
+def test_cells_see_edges_as_those_of_the_slow_twin_do(taichi, views, generator, split):
     views = replace(views, box=np.array([[-0.1, 0.1, 0.0], [1.1, 0.9, 1.4]]))  # part of it is outside the images
     size, needed = 0.02, voting.KEEP * len(views)
     cells = generator.integers(0, np.ceil((views.box[1] - views.box[0]) / size) // (1 + split), (2000, 3), np.int32)
@@ -109,8 +105,7 @@ def test_cells_see_edges_as_those_of_the_slow_twin_do(start_taichi, views, gener
     assert clear.mean() > 0.8 and 0.05 < found.mean() < 0.95
 
 
-def test_more_levels_find_the_same_cells_and_none_is_entered_that_is_too_large(start_taichi, views, monkeypatch):
-    start_taichi("f32", 2)
+def test_more_levels_find_the_same_cells_and_none_is_entered_that_is_too_large(taichi, views, monkeypatch):
     distances, pixel = DistanceBatches(views.edge_maps, 0.5), voting.pixel_size(views)
     cells, size = vote_cells(views, distances, pixel)
     assert size == pytest.approx(voting.FINEST_PX * pixel)
@@ -184,9 +179,8 @@ class Warned:
 
 @pytest.mark.parametrize("points, named", [("", "random points"), ("cloud.ply", "the given points")])
 def test_without_votes_the_training_starts_from_the_given_or_random_points(
-    start_taichi, views, tmp_path, generator, points, named
+    taichi, views, tmp_path, generator, points, named
 ):
-    start_taichi("f32", 2)
     blank = replace(views, edge_maps=np.zeros_like(views.edge_maps))
     given = generator.random((80, 3)).astype(np.float32)
     if points:

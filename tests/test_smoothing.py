@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from edgel_scenes import edgel_errors, either_errors
 
 from taichi_edges.detectors.smoothing import LEAST_AROUND, with_smooth_normals
 from taichi_edges.views.edgels import Edgels
@@ -10,9 +11,7 @@ SIZE = 240
 NOISE_PX, TURNED = 0.15, 3.0  # of detected edgels: px across the edge; degrees, of a single normal
 
 
-@pytest.fixture(autouse=True)
-def taichi(start_taichi):
-    start_taichi("f32", 2)
+pytestmark = pytest.mark.usefixtures("taichi")
 
 
 def unit(degrees):
@@ -20,15 +19,15 @@ def unit(degrees):
     return np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))], axis=-1)
 
 
-def noisy(points, angles, generator, noise=NOISE_PX, turned=TURNED):
+def noisy(points, angles, generator, noise=NOISE_PX, turned=TURNED, errors="white"):
     """A view of points on edges whose normals are at `angles`, degrees: moved across, normals turned and flipped."""
     count = len(points)
-    points = points + generator.normal(0, noise, (count, 1)) * unit(angles)
+    points = points + noise * edgel_errors(points, generator, errors)[:, None] * unit(angles)
     normals = unit(angles + generator.normal(0, turned, count)) * generator.choice([-1, 1], (count, 1))
     return points, normals, generator.uniform(0.2, 1, count)
 
 
-def errors(normals, angles):
+def degrees_off(normals, angles):
     """(n,) degrees in -90..90 from the true angles to those of normals of either sign."""
     found = np.degrees(np.arctan2(normals[:, 1], normals[:, 0]))
     return (found - angles + 90) % 180 - 90
@@ -39,57 +38,72 @@ def straight(middle, angle, count=81):
     return np.asarray(middle) + (np.arange(count) - count // 2)[:, None] * unit(angle), np.full(count, angle + 90.0)
 
 
+@either_errors()
 @pytest.mark.parametrize("angle", [0.0, 23.0, 45.0, 90.0, 137.0])
-def test_normals_of_a_line(generator, angle):
+def test_normals_of_a_line(generator, angle, errors):
     views, truth = [], []
     for _ in range(8):
         points, angles = straight(generator.uniform(100, 140, 2), angle)
-        views.append(noisy(points, angles, generator))
+        views.append(noisy(points, angles, generator, errors=errors))
         truth.append(angles)
-    off = errors(with_smooth_normals(Edgels.of_views(views), SIZE, SIZE).normals, np.concatenate(truth))
+    off = degrees_off(with_smooth_normals(Edgels.of_views(views), SIZE, SIZE).normals, np.concatenate(truth))
     # Slope through 17 edgels: 0.15 px / sqrt(17^3 / 12) is 0.43 degrees; at the ends 9 to one side: 2 degrees.
     inner = np.tile(np.abs(np.arange(81) - 40) <= 32, 8)
     assert np.sqrt((off[inner] ** 2).mean()) < 0.9 and np.quantile(np.abs(off[inner]), 0.99) < 3.0
     assert np.sqrt((off**2).mean()) < 1.2 and abs(off.mean()) < 0.3
 
 
-def test_normals_of_a_circle_are_unbiased(generator):
+@either_errors()
+def test_normals_of_a_circle_are_unbiased(generator, errors):
     angles = np.degrees(np.arange(0, 2 * np.pi, 1 / 40))
-    views = [noisy(generator.uniform(110, 130, 2) + 40 * unit(angles), angles, generator) for _ in range(6)]
-    off = errors(with_smooth_normals(Edgels.of_views(views), SIZE, SIZE).normals, np.tile(angles, 6))
+    views = [
+        noisy(generator.uniform(110, 130, 2) + 40 * unit(angles), angles, generator, errors=errors) for _ in range(6)
+    ]
+    off = degrees_off(with_smooth_normals(Edgels.of_views(views), SIZE, SIZE).normals, np.tile(angles, 6))
     assert np.sqrt((off**2).mean()) < 1.0 and np.quantile(np.abs(off), 0.97) < 3.0
     assert abs(off.mean()) < 0.15  # 0.5 degrees each, over some 1500 that share their neighbours with 17
 
 
-def test_tight_bends_are_not_straightened(generator):
+@either_errors()
+def test_tight_bends_are_not_straightened(generator, errors):
     angles = np.degrees(np.arange(0, 2 * np.pi, 1 / 25))
-    views = [noisy(generator.uniform(110, 130, 2) + 25 * unit(angles), angles, generator) for _ in range(6)]
+    views = [
+        noisy(generator.uniform(110, 130, 2) + 25 * unit(angles), angles, generator, errors=errors) for _ in range(6)
+    ]
     edgels, truth = Edgels.of_views(views), np.tile(angles, 6)
-    off = errors(with_smooth_normals(edgels, SIZE, SIZE).normals, truth)
-    assert np.sqrt((off**2).mean()) < 0.75 * np.sqrt((errors(edgels.normals, truth) ** 2).mean())
+    off = degrees_off(with_smooth_normals(edgels, SIZE, SIZE).normals, truth)
+    assert np.sqrt((off**2).mean()) < 0.75 * np.sqrt((degrees_off(edgels.normals, truth) ** 2).mean())
 
 
-def test_ends_of_bends_are_no_chords(generator):
+@either_errors()
+def test_ends_of_bends_are_no_chords(generator, errors):
     angles = np.degrees(np.arange(60) / 40)
-    views = [noisy(generator.uniform(110, 130, 2) + 40 * unit(angles), angles, generator, 0.05) for _ in range(20)]
-    off = errors(with_smooth_normals(Edgels.of_views(views), SIZE, SIZE).normals, np.tile(angles, 20)).reshape(20, 60)
+    views = [
+        noisy(generator.uniform(110, 130, 2) + 40 * unit(angles), angles, generator, 0.05, errors=errors)
+        for _ in range(20)
+    ]
+    off = degrees_off(with_smooth_normals(Edgels.of_views(views), SIZE, SIZE).normals, np.tile(angles, 20))
+    off = off.reshape(20, 60)
     assert np.abs(off[:, [0, -1]].mean(axis=0)).max() < 0.8 * np.degrees(4 / 40)  # of the chord of the last 8 px
 
 
-def test_corners_are_not_mixed(generator):
+@either_errors()
+def test_corners_are_not_mixed(generator, errors):
     along, corner = np.arange(1, 41)[:, None], np.array([100.0, 100.0])
-    arms = [noisy(corner + along * unit(arm), np.full(40, arm + 90.0), generator) for arm in (0.0, 75.0)]
+    arms = [noisy(corner + along * unit(arm), np.full(40, arm + 90.0), generator, errors=errors) for arm in (0.0, 75.0)]
     points, normals, strengths = (np.concatenate(columns) for columns in zip(*arms, strict=True))
     together = with_smooth_normals(Edgels.of_views([(points, normals, strengths)]), SIZE, SIZE).normals
     alone = [with_smooth_normals(Edgels.of_views([arm]), SIZE, SIZE).normals for arm in arms]
     np.testing.assert_allclose(together, np.concatenate(alone), atol=1e-6)  # but for the order of sums
-    assert np.sqrt((errors(together, np.repeat([90.0, 165.0], 40)) ** 2).mean()) < 1.8
+    assert np.sqrt((degrees_off(together, np.repeat([90.0, 165.0], 40)) ** 2).mean()) < 1.8
 
 
-def test_parallel_edges_are_not_mixed(generator):
+@either_errors()
+def test_parallel_edges_are_not_mixed(generator, errors):
     runs = [straight([100, 100 + 2 * k], 0.0) for k in range(3)]
     points, angles = (np.concatenate(columns) for columns in zip(*runs, strict=True))
-    off = errors(with_smooth_normals(Edgels.of_views([noisy(points, angles, generator)]), SIZE, SIZE).normals, angles)
+    views = [noisy(points, angles, generator, errors=errors) for _ in range(8)]
+    off = degrees_off(with_smooth_normals(Edgels.of_views(views), SIZE, SIZE).normals, np.tile(angles, 8))
     assert np.sqrt((off**2).mean()) < 1.5
 
 
@@ -136,5 +150,7 @@ def test_place_in_a_large_image_does_not_matter(generator):
 
 def test_edgels_outside_the_image_do_no_harm(generator):
     points, angles = straight([0.0, 100.0], 5.0)  # a calibration moved half of them out
-    off = errors(with_smooth_normals(Edgels.of_views([noisy(points, angles, generator)]), SIZE, SIZE).normals, angles)
+    off = degrees_off(
+        with_smooth_normals(Edgels.of_views([noisy(points, angles, generator)]), SIZE, SIZE).normals, angles
+    )
     assert np.sqrt((off[40:] ** 2).mean()) < 1.5 and np.isfinite(off).all()

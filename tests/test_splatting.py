@@ -63,6 +63,7 @@ def test_image_is_the_twins(open_splatter, seed, generator, real, count):
         assert_image(image, gaussians, scene.camera(view), real)
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 @pytest.mark.parametrize("width", [31, 32, 33, 64, 100])  # the mask packs 32 columns into a word
 def test_image_of_any_width_is_the_twins(open_splatter, seed, generator, width):
     scene = random_scene(seed, width, HEIGHT)
@@ -92,6 +93,7 @@ def test_random_inputs_reach_every_branch(seed, generator):
     assert (contributions == 0.999).sum() > 0, "clamped"
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 @pytest.mark.parametrize("threads", [1, 3])
 def test_image_does_not_depend_on_the_number_of_threads(open_splatter, seed, generator, threads):
     scene, gaussians = random_scene(seed, WIDTH, HEIGHT), random_gaussians(1025, generator)
@@ -104,6 +106,7 @@ def test_image_does_not_depend_on_the_number_of_threads(open_splatter, seed, gen
     np.testing.assert_allclose(1 - images[0], 1 - images[1], rtol=0, atol=1025 * 6e-8)
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 def test_schedule_of_the_gpu_gives_the_same_image(open_splatter, seed, generator):
     scene, gaussians = random_scene(seed, WIDTH, HEIGHT), random_gaussians(513, generator)
     splatter = open_splatter(scene, loss="whole_image", schedule="log")
@@ -112,6 +115,7 @@ def test_schedule_of_the_gpu_gives_the_same_image(open_splatter, seed, generator
         assert_image(splatter.render(view), gaussians, scene.camera(view), "f64")
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 def test_one_round_gaussian_by_hand(open_splatter):
     """sigma 2 px at the middle of a view along z: covariance 4 + 0.3, opacity times 4 / 4.3."""
     intrinsics = np.array([[[100.0, 0, 16], [0, 100, 16], [0, 0, 1]]])
@@ -126,6 +130,7 @@ def test_one_round_gaussian_by_hand(open_splatter):
     np.testing.assert_allclose(image, image[::-1], atol=1e-15)
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 def test_views_do_not_leave_traces_in_each_other(open_splatter, seed, generator):
     splatter = open_splatter(random_scene(seed, WIDTH, HEIGHT), loss="whole_image")
     splatter.load(random_gaussians(300, generator))
@@ -156,6 +161,7 @@ def assert_words(words, chosen):
     np.testing.assert_array_equal(words[:, :, 1].ravel(), np.concatenate([[0], np.cumsum(sizes)[:-1]]))
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 @pytest.mark.parametrize("threads", [1, 3])
 def test_pages_hold_what_each_view_alone_would(open_splatter, seed, threads):
     scene = random_scene(seed, WIDTH, HEIGHT)
@@ -170,6 +176,7 @@ def test_pages_hold_what_each_view_alone_would(open_splatter, seed, threads):
             np.testing.assert_array_equal(of_page, alone)
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 def test_maps_too_large_for_one_array_are_handed_over_by_the_page(open_splatter, seed, monkeypatch):
     splatter = open_splatter(random_scene(seed, WIDTH, HEIGHT))
     selections = []
@@ -195,6 +202,7 @@ def test_loss_and_gradients_are_those_of_the_page(open_splatter, seed, generator
     np.testing.assert_array_equal(results[0][1], results[1][1])
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 def test_whole_image_weighs_every_pixel_alike(open_splatter, seed):
     scene = random_scene(seed, WIDTH, HEIGHT)
     splatter = open_splatter(scene, loss="whole_image")
@@ -205,6 +213,7 @@ def test_whole_image_weighs_every_pixel_alike(open_splatter, seed):
     np.testing.assert_allclose(targets, scene.edge_maps[OBLIQUE].ravel() / 255, rtol=1e-15)
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 @pytest.mark.parametrize("view", [OBLIQUE, MOSTLY_EDGES, NO_EDGES])
 def test_class_weights_give_edges_and_background_one_half_each(open_splatter, seed, view):
     scene = random_scene(seed, WIDTH, HEIGHT)
@@ -217,6 +226,7 @@ def test_class_weights_give_edges_and_background_one_half_each(open_splatter, se
             np.testing.assert_allclose(weights[pixels], 0.5 / pixels.sum(), rtol=1e-15)
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 @pytest.mark.parametrize("view", [OUTSIDE, OBLIQUE, MOSTLY_EDGES])
 def test_balanced_selection_has_all_edge_pixels_and_as_many_others(open_splatter, seed, view):
     scene = random_scene(seed, WIDTH, HEIGHT)
@@ -267,6 +277,7 @@ def test_a_view_without_edge_pixels_selects_none(open_splatter, seed, generator)
     assert splatter.loss[None] == 0.0
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 @pytest.mark.parametrize("loss", ["balanced", "class_weighted", "whole_image"])
 def test_loss_is_the_twins(open_splatter, seed, generator, loss):
     scene, gaussians = random_scene(seed, WIDTH, HEIGHT), random_gaussians(100, generator)
@@ -279,6 +290,7 @@ def test_loss_is_the_twins(open_splatter, seed, generator, loss):
         assert splatter.loss[None] == pytest.approx(expected, abs=1e-11)  # a mean of |C - target|: as exact as C
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 def test_threshold_parts_edges_from_background_at_the_same_level_as_the_views(open_splatter):
     maps = np.arange(256, dtype=np.uint8).reshape(1, 16, 16)
     scene = Scene(maps, np.eye(3)[None], np.eye(4)[None, :3])
@@ -293,6 +305,7 @@ def test_threshold_parts_edges_from_background_at_the_same_level_as_the_views(op
 # Weights and flanks ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 @pytest.mark.parametrize("share", [0.6, 1.0])
 @pytest.mark.parametrize("loss", ["balanced", "whole_image", "class_weighted"])
 def test_edge_pixels_weigh_what_the_strongest_edgel_near_says(open_splatter, seed, loss, share):
@@ -311,6 +324,7 @@ def test_edge_pixels_weigh_what_the_strongest_edgel_near_says(open_splatter, see
             assert weights[edges].sum() == pytest.approx(equal, rel=1e-12), "the balance is kept"
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 def test_weights_are_those_of_the_view_on_every_page(open_splatter, seed, monkeypatch):
     scene = random_scene(seed, WIDTH, HEIGHT)
     splatter = open_splatter(scene, strength_weight=0.6)
@@ -352,6 +366,7 @@ def hidden_pixels(scene, view, points):
     return hidden, tie
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 @pytest.mark.parametrize("schedule", ["product", "log"])
 def test_flanks_are_in_the_mask_but_where_an_established_edge_is_hidden(open_splatter, seed, schedule):
     scene, points = drawn_lines(seed)
@@ -378,6 +393,7 @@ def test_flanks_are_in_the_mask_but_where_an_established_edge_is_hidden(open_spl
 # Gaussians ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 def test_gaussians_grow_beyond_the_capacity_without_a_change(open_splatter, seed, generator):
     scene = random_scene(seed, WIDTH, HEIGHT)
     splatter = open_splatter(scene, loss="whole_image", edge_threshold=0.6)  # of its own: the others stay small
@@ -414,8 +430,7 @@ def test_direction_is_the_axis_of_the_largest_scale(generator):
     np.testing.assert_allclose(np.abs((largest * gaussians.directions()).sum(axis=1)), 1, atol=1e-9)
 
 
-def test_fast_exp2_is_a_power_of_two_to_single_precision(start_taichi):
-    start_taichi("f32", 2)
+def test_fast_exp2_is_a_power_of_two_to_single_precision(taichi):
 
     @ti.kernel
     def evaluate(x: ti.types.ndarray(dtype=ti.f32, ndim=1), y: ti.types.ndarray(dtype=ti.f32, ndim=1)):

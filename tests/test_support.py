@@ -17,11 +17,6 @@ from taichi_edges.views.views import Views
 SIZE, VIEWS = 200, 24
 
 
-@pytest.fixture
-def taichi(start_taichi):
-    start_taichi("f32", 2)
-
-
 def scene(*segments):
     """Views of straight 3D segments, none of them hidden, drawn as clean lines."""
     intrinsics, poses = ring_cameras(VIEWS, SIZE)
@@ -171,6 +166,7 @@ def test_batches_and_repeated_claims_do_not_change_the_support(taichi, generator
     np.testing.assert_array_equal(exclusive_support(views, points, 0.5), expected)
 
 
+@pytest.mark.slow(reason="starts Taichi anew")
 def test_support_does_not_depend_on_the_threads(start_taichi, generator):
     views = noise(generator)
     points = generator.uniform(0, 1, (40_000, 3))  # enough for Taichi to use more than one thread

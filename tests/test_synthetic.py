@@ -176,6 +176,7 @@ def test_drawn_edges_are_centred_on_the_projected_curves(parts, name):
     assert np.abs(errors).max() < 0.1
 
 
+@pytest.mark.slow(reason="renders whole parts")
 @pytest.mark.parametrize("name", ["knob", "demo", "pipe", "fillet", "blade"])
 def test_edges_and_contours_together_outline_the_part(parts, name):
     with_contours = dataclasses.replace(CLEAN, contours=True)
@@ -229,14 +230,13 @@ def test_wider_lines_are_wider(parts):
     assert areas[1] / areas[0] == pytest.approx(2.0, rel=0.1)
 
 
-def test_render_views_gives_views_and_pictures(parts, start_taichi):
+def test_render_views_gives_views_and_pictures(parts, taichi):
     views, pictures = render_views(parts["demo"], 4, 120, Imperfections(), np.random.default_rng(0))
     assert len(views) == 4 and (views.height, views.width) == (120, 120) and set(views.image_paths) == {""}
     assert pictures.shape == (4, 120, 120, 3) and pictures.dtype == np.uint8
     assert (pictures[:, 0, 0] == 255).all() and (pictures[:, 60, 60] < 250).all()
     on_edges = sample_edges(parts["demo"], 0.02).points
     assert all(inside_image(views.project(on_edges, view)[0], 120, 120).all() for view in range(4))
-    start_taichi("f32", 2)
     assert (edge_strength(views, on_edges) > 0.5 / 4).mean() > 0.9  # an edge pixel in one view of four, at least
 
 

@@ -17,7 +17,6 @@ from taichi_edges.splatting.density import Population, cull_opacity, cull_suppor
 from taichi_edges.splatting.gaussians import Gaussians, logit, start_gaussians
 from taichi_edges.splatting.training import Settling, Training, nearest_neighbors, rates
 from taichi_edges.synthetic.parts import PARTS
-from taichi_edges.synthetic.rendering import Imperfections, render_views
 from taichi_edges.synthetic.visibility import sample_edges
 from taichi_edges.views.drawing import draw_edge_maps
 
@@ -25,11 +24,9 @@ PIXEL = 0.02  # unit-cube units, in views of 96 x 96: the cube is some 60 px wid
 
 
 @pytest.fixture(scope="module")
-def block():
-    """A block of known edges, and 12 small views of it."""
-    part = PARTS["block"]()
-    views, _ = render_views(part, 12, 96, Imperfections.none(), np.random.default_rng(0))
-    return views, sample_edges(part, 0.002).points
+def block(clean_block):
+    """12 small views of a block, and points on its edges."""
+    return clean_block(12, 96)[0], sample_edges(PARTS["block"](), 0.002).points
 
 
 def numbered_population(means, opacities=None):
@@ -193,6 +190,7 @@ def test_the_loss_has_settled_when_two_passes_hardly_lower_it():
     assert settling.drop() == pytest.approx(0.0)
 
 
+@pytest.mark.slow(reason="trains")
 @pytest.mark.parametrize("settled, end", [(1.0, 60 + 3 * 12), (0.0, 240)])
 def test_a_run_ends_early_only_when_nothing_more_is_scheduled(start_taichi, block, settled, end):
     density = {"duplicate_at": [], "cull_opacity_at": [0.25], "cull_support_at": [], "min_opacity": 0.0}
@@ -205,6 +203,7 @@ def test_a_run_ends_early_only_when_nothing_more_is_scheduled(start_taichi, bloc
     assert records[-1].step == end
 
 
+@pytest.mark.slow(reason="trains")
 @pytest.mark.parametrize("least, share_of_strays", [(0.0, None), (0.3, 0.1)])
 def test_flanks_spare_established_edges_but_no_strays(
     start_taichi, block, generator, monkeypatch, least, share_of_strays
@@ -239,6 +238,7 @@ def test_flanks_spare_established_edges_but_no_strays(
     assert len(given) == 2
 
 
+@pytest.mark.slow(reason="trains")
 def test_no_end_before_the_regularizers_have_begun(start_taichi, block):
     density = {"duplicate_at": [], "cull_opacity_at": [], "cull_support_at": []}
     config = paper_training(epochs=0, steps=120, settled=1.0, gaussians=300, regularize_from=0.75, density=density)
@@ -252,6 +252,7 @@ def test_maps_without_any_edge_pixel_are_refused(start_taichi, block):
         train(start_taichi, (views, None), paper_training(gaussians=300))
 
 
+@pytest.mark.slow(reason="trains")
 @pytest.mark.parametrize("loss, visited", [("balanced", 7), ("whole_image", 12)])
 def test_an_epoch_is_one_pass_over_the_views_that_say_something(start_taichi, block, loss, visited):
     edge_maps = block[0].edge_maps.copy()
@@ -261,6 +262,7 @@ def test_an_epoch_is_one_pass_over_the_views_that_say_something(start_taichi, bl
     assert records[-1].step == 3 * visited
 
 
+@pytest.mark.slow(reason="trains")
 @pytest.mark.parametrize("steps, total", [(5, 12), (30, 30)])
 def test_every_view_is_seen_at_least_once(start_taichi, block, steps, total):
     config = paper_training(epochs=0, steps=steps, gaussians=300, density={"duplicate_at": []})
@@ -281,6 +283,7 @@ def train(start_taichi, block, config):
     return start, *Training(views, config, generator, threads=2).run(start, Progress())
 
 
+@pytest.mark.slow(reason="trains")
 def test_training_finds_the_edges_of_a_block(start_taichi, block):
     """A short schedule with everything in it: positions alone, duplication, culls, regularisers."""
     density = {"duplicate_at": [0.4, 0.55], "cull_opacity_at": [0.75], "cull_support_at": [0.7]}
@@ -306,6 +309,7 @@ def test_training_finds_the_edges_of_a_block(start_taichi, block):
         assert np.isfinite(array).all()
 
 
+@pytest.mark.slow(reason="trains")
 def test_flanks_bring_the_centres_onto_the_lines(start_taichi, block):
     """From starts beside the edges, with rates at which a Gaussian can shrink within the run."""
     views, edges = block
@@ -331,6 +335,7 @@ def redrawn(views):
     return draw_edge_maps(edgels, views.height, views.width)
 
 
+@pytest.mark.slow(reason="trains")
 def test_the_same_seed_trains_the_same_gaussians(start_taichi, block):
     density = {"duplicate_at": [0.5], "cull_opacity_at": [], "cull_support_at": [0.75]}
     schedule = {"only_means": 0.4, "regularize_from": 0.6, "regularize_every": 3, "flanks_from": 0.5}

@@ -129,6 +129,7 @@ def test_an_arc_goes_on_where_it_is_moved_to_its_middle():
 # ------------------------------------------------------------------------------------------------------ whole edges
 
 
+@pytest.mark.slow(reason="grows thousands of points")
 @pytest.mark.parametrize("noise", NOISES)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_rim_that_lines_touch_is_one_closed_circle(noise, seed):
@@ -148,6 +149,7 @@ def test_a_rim_that_lines_touch_is_one_closed_circle(noise, seed):
     assert count_edges(edges) <= 6  # one of the lines goes on beyond its contact: it may be two
 
 
+@pytest.mark.slow(reason="grows thousands of points")
 @pytest.mark.parametrize("seed", SEEDS)
 def test_curves_that_touch_a_rim_in_their_middle_leave_it_whole(seed):
     """Hyperbola-like arcs of a chamfered nut: each touches the rim and meets the next one in a cusp."""
@@ -186,6 +188,7 @@ def test_a_line_with_gaps_is_one(noise):
     assert edges.lengths[0] == pytest.approx(0.6, abs=2 * SPACING)
 
 
+@pytest.mark.slow(reason="grows thousands of points")
 @pytest.mark.parametrize("noise", NOISES)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_filleted_corner_is_line_arc_line(noise, seed):
@@ -202,6 +205,7 @@ def test_parallel_edges_2_mm_apart_are_two():
     assert len(edges.lines) == 2 and (edges.lengths > 0.38).all()
 
 
+@pytest.mark.slow(reason="grows thousands of points")
 @pytest.mark.parametrize("noise", NOISES)
 def test_an_edge_seen_twice_is_one(noise):
     parts = [line((0, 0, 0), (0.4, 0, 0)), line((0.1, noise, 0), (0.35, noise, 0)), circle(0.2), circle(0.2 + noise)]
@@ -301,6 +305,7 @@ def helix(t):
     return np.stack([0.5 + 0.2 * np.cos(6 * np.pi * t), 0.5 + 0.2 * np.sin(6 * np.pi * t), 0.2 + 0.6 * t], axis=1)
 
 
+@pytest.mark.slow(reason="grows thousands of points")
 @pytest.mark.parametrize(("curve", "closed"), [(ellipse, True), (saddle, True), (wave, False), (helix, False)])
 def test_a_free_curve_is_one_edge_and_closes_if_it_is_closed(generator, curve, closed):
     fine = np.linspace(0, 1, 20001)

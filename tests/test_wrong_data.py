@@ -12,9 +12,6 @@ import numpy as np
 import pytest
 
 from taichi_edges.files.ply import write_float_vertices
-from taichi_edges.synthetic.drawing import Imperfections
-from taichi_edges.synthetic.parts import PARTS
-from taichi_edges.synthetic.rendering import render_views
 from taichi_edges.views.cameras import OPENGL_TO_OPENCV, invert_pose
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
@@ -25,10 +22,10 @@ CUBE = "[[0, 0, 0], [1, 1, 1]]"
 POINTS = np.random.default_rng(0).uniform(0.1, 0.9, (300, 3))
 
 
-@pytest.fixture(scope="module")
-def rendered():
+@pytest.fixture
+def rendered(clean_block):
     """Square views, and their pictures: cut to WIDTH x HEIGHT below."""
-    return render_views(PARTS["block"](), VIEWS, WIDTH, Imperfections.none(), np.random.default_rng(0))
+    return clean_block(VIEWS, WIDTH)
 
 
 class Scene:
