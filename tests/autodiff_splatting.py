@@ -1,6 +1,6 @@
 """The splat and the image loss written plainly and differentiated by Taichi: the oracle of the hand-written adjoint."""
 
-from functools import lru_cache
+from functools import cache
 
 import taichi as ti
 from reference_splatting import selected
@@ -77,7 +77,7 @@ class AutodiffSplat:
         return self.transmittance.to_numpy()[:slots]
 
 
-@lru_cache(maxsize=None)
+@cache
 def autodiff_of(splatter):
     """The AutodiffSplat of a Splatter; its kernels are built once."""
     return AutodiffSplat(splatter)

@@ -57,7 +57,7 @@ def offers(arch):
     """Whether Taichi gets such a device here; asked of another process, which a broken driver may take with it."""
     command = [sys.executable, "-c", PROBE, arch]
     try:
-        return subprocess.run(command, capture_output=True, timeout=60).returncode == 0
+        return subprocess.run(command, capture_output=True, timeout=60, check=False).returncode == 0
     except subprocess.TimeoutExpired:
         return False
 
@@ -76,7 +76,7 @@ def generator(request):
 
 @pytest.fixture(scope="session")
 def clean_block():
-    """clean_block(count, size) -> (Views, pictures) of the block with clean edge maps, not to be changed; drawn once."""
+    """clean_block(count, size) -> (Views, pictures) of the block with clean maps, not to be changed; drawn once."""
 
     @cache
     def rendered(count, size):

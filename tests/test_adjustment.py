@@ -145,7 +145,7 @@ def test_hidden_views_do_not_matter(taichi, generator, errors):
         views_of([curve_of(s) for s in true.shapes], generator, noise_px=0.05, hidden=0.6, errors=errors)
     )
     found = adjusted(corner(CORNERS + 0.4 * matching.pixel * generator.uniform(-1, 1, CORNERS.shape)), matching)
-    assert all(off(*pair) < 0.05 * matching.pixel for pair in zip(found.shapes, true.shapes))
+    assert all(off(*pair) < 0.05 * matching.pixel for pair in zip(found.shapes, true.shapes, strict=True))
 
 
 @either_errors()
@@ -201,7 +201,7 @@ def test_flip_is_refused(taichi, generator):
     longer = Constraint((0,), lambda shape: np.array([shape.length - 2 * true.shapes[0].length]), 1e-9)
     found = adjusted(true, matching, [longer])
     np.testing.assert_array_equal(found.vertices[:2], CORNERS[:2])
-    assert all(off(*pair) < 0.02 * matching.pixel for pair in zip(found.shapes, true.shapes))
+    assert all(off(*pair) < 0.02 * matching.pixel for pair in zip(found.shapes, true.shapes, strict=True))
 
 
 def test_constraint_is_exact(taichi, generator):

@@ -137,7 +137,7 @@ def test_texture_that_differs_from_view_to_view_is_no_edge(taichi, generator, se
 def test_frames_close_and_keep_their_depth_in_the_wireframe(taichi, generator, errors):
     views, upright, level = facade(generator, errors=errors)
     wireframe, counts = refine_wireframe(Wireframe.loose(upright), views, RefineConfig(enabled=True, anchor=True))
-    found = matched(ends_of([shape for shape in wireframe.shapes[len(upright) :]]), level, pixel_of(views))
+    found = matched(ends_of(list(wireframe.shapes[len(upright) :])), level, pixel_of(views))
     assert counts.anchored == len(level) and sorted(found.tolist()) == list(range(len(level)))
     assert len(wireframe.vertices) == 2 * len(upright) and (wireframe.degrees == 2).all()
 

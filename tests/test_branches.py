@@ -134,7 +134,7 @@ def slow_cuts(chain):
     best = [(0.0, [0], [])]  # cost, bounds and kinds of the cheapest way to each station
     for end in stations[1:]:
         ways = []
-        for (cost, bounds, kinds), start in zip(best, stations):
+        for (cost, bounds, kinds), start in zip(best, stations, strict=True):
             line, curve = slow_costs(chain[start:end], noise)
             ways.append((cost + line + LINE_PRICE * price, [*bounds, end], [*kinds, False]))
             ways.append((cost + curve + CURVE_PRICE * price, [*bounds, end], [*kinds, True]))
@@ -157,7 +157,7 @@ def test_costs_of_all_stretches_match_those_of_one_at_a_time(generator, monkeypa
     monkeypatch.setattr(segmentation, "BLOCK", block)
     chain = rough_chain(generator, 60)
     ends, starts = np.tril_indices(61, -1)
-    expected = np.array([slow_costs(chain[a:b], NOISE) for a, b in zip(starts, ends)])
+    expected = np.array([slow_costs(chain[a:b], NOISE) for a, b in zip(starts, ends, strict=True)])
     # Sums of at most 60 terms up to 9, from points of the size 5 known to 1e-15: squares of residuals to 1e-14 / 1e-6.
     np.testing.assert_allclose(np.stack(stretch_costs(chain, starts, ends, NOISE), axis=1), expected, atol=1e-6)
 

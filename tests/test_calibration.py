@@ -62,8 +62,8 @@ def part(tmp_path_factory):
     scene, pixel = ray_scene(solid), pixel_size(intrinsics, poses)
     edges = sample_edges(solid, SAMPLE_PX * pixel)
     samples, paths = [], []
-    for view, camera in enumerate(zip(intrinsics, poses)):
-        lens, pose = camera
+    for view, camera in enumerate(zip(intrinsics, poses, strict=True)):
+        _lens, pose = camera
         drawn = edges.with_further(sample_contours(solid, camera_centre(pose), SAMPLE_PX * pixel))
         pixels, _ = project(drawn.points, *camera)
         visible = visible_from(scene, drawn, camera_centre(pose))
@@ -178,7 +178,7 @@ def test_without_bias_nothing_moves(part, generator, images):
 def test_opaque_pictures_measure_the_shift_but_never_the_silhouettes(part, generator, tmp_path):
     views, edgels = planted(part, SHIFT, OFFSET)
     paths = tuple(str(tmp_path / f"{view}.png") for view in range(VIEWS))
-    for path, source in zip(paths, views.image_paths):
+    for path, source in zip(paths, views.image_paths, strict=True):
         cv2.imwrite(path, cv2.imread(source, cv2.IMREAD_UNCHANGED)[:, :, :3])
     _, found = calibrate(replace(views, image_paths=paths), edgels, *seeds(part, generator))
     assert found.shift == pytest.approx(SHIFT, abs=0.1)

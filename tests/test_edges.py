@@ -56,7 +56,7 @@ def noisy_arc(radius, start, end, count, noise=0.0, seed=0, centre=CENTRE):
 
 def joined(*parts):
     """One set of points and directions out of several."""
-    return tuple(np.concatenate(arrays) for arrays in zip(*parts))
+    return tuple(np.concatenate(arrays) for arrays in zip(*parts, strict=True))
 
 
 def partition(labels):
@@ -268,7 +268,7 @@ def test_pieces_of_a_graph_are_joined_by_their_shortest_connections(generator):
         expected[min(a, b), max(a, b)] = distances[a, b]
         inside |= labels == labels[b]
     bridged = join_pieces(points, coo_array((108, 108)).tocsr(), labels).tocoo()
-    found = {(a, b): value for a, b, value in zip(*bridged.coords, bridged.data) if a < b}
+    found = {(a, b): value for a, b, value in zip(*bridged.coords, bridged.data, strict=True) if a < b}
     assert bridged.nnz == 2 * len(found) and found.keys() == expected.keys()
     np.testing.assert_allclose([found[pair] for pair in expected], list(expected.values()))
     assert connected_components(connected_graph(points), directed=False)[0] == 1
@@ -421,7 +421,7 @@ def test_distances_to_a_chain_match_brute_force(generator):
     # The second derivatives are below 6 * 0.8, so chords of 1/127 in the parameter are off by 4.8 / 8 / 127^2 at most.
     np.testing.assert_allclose(distances, expected, atol=2e-4)
     pieces = np.minimum(parameters.astype(int), 2)
-    reached = [evaluate_bezier(curves[piece], [at - piece])[0] for piece, at in zip(pieces, parameters)]
+    reached = [evaluate_bezier(curves[piece], [at - piece])[0] for piece, at in zip(pieces, parameters, strict=True)]
     np.testing.assert_allclose(np.linalg.norm(np.array(reached) - points, axis=1), expected, atol=5e-4)
 
 

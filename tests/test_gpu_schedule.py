@@ -191,7 +191,7 @@ def adam(splatter, inputs):
     splatter.load(inputs.gaussians)
     fields = splatter.fields
     for step, pulls in enumerate(inputs.pulls, start=1):
-        for name, pull in zip(PARAMETERS, pulls):
+        for name, pull in zip(PARAMETERS, pulls, strict=True):
             gradient = getattr(fields, name).grad
             whole = np.zeros_like(gradient.to_numpy())
             whole[: len(pull)] = pull
@@ -206,7 +206,7 @@ def adam(splatter, inputs):
 def assert_pages(actual, expected):
     """The same pixels in the same slots; targets and weights to single precision."""
     assert len(actual) == len(expected)
-    for page, of_cpu in zip(actual, expected):
+    for page, of_cpu in zip(actual, expected, strict=True):
         np.testing.assert_array_equal(page[0], of_cpu[0])
         np.testing.assert_array_equal(page[1], of_cpu[1])
         np.testing.assert_allclose(page[2], of_cpu[2], rtol=2 * 6e-8)
@@ -240,7 +240,7 @@ def test_selections_of_whole_images_are_the_cpus(results):
 
 def test_images_are_the_cpus(results):
     real, actual, expected = results
-    for view, of_cpu in zip(actual.views, expected.views):
+    for view, of_cpu in zip(actual.views, expected.views, strict=True):
         np.testing.assert_allclose(view.transmittance, of_cpu.transmittance, rtol=0, atol=IMAGE[real])
         assert view.loss == pytest.approx(of_cpu.loss, abs=IMAGE[real])  # a mean of |C - target|: as exact as C
     np.testing.assert_allclose(actual.image, expected.image, rtol=0, atol=IMAGE[real])
@@ -248,7 +248,7 @@ def test_images_are_the_cpus(results):
 
 def test_gradients_are_the_cpus(results):
     real, actual, expected = results
-    for view, of_cpu in zip(actual.views, expected.views):
+    for view, of_cpu in zip(actual.views, expected.views, strict=True):
         assert_gradients(view.gradients, of_cpu.gradients, GRADIENT[real])
         scale = of_cpu.positional.max()
         np.testing.assert_allclose(view.positional, of_cpu.positional, rtol=0, atol=GRADIENT[real] * scale)
@@ -256,7 +256,7 @@ def test_gradients_are_the_cpus(results):
 
 def test_gradients_with_weights_and_flanks_are_the_cpus(results):
     real, actual, expected = results
-    for view, of_cpu in zip(actual.weighted_views, expected.weighted_views):
+    for view, of_cpu in zip(actual.weighted_views, expected.weighted_views, strict=True):
         assert view.loss == pytest.approx(of_cpu.loss, abs=IMAGE[real])
         assert_gradients(view.gradients, of_cpu.gradients, GRADIENT[real])
 
@@ -265,7 +265,7 @@ def test_regularizers_are_the_cpus(results):
     """Sums of 600 and some numbers that cancel little: 600 roundings of 6e-8 in f32."""
     real, actual, expected = results
     tolerance = {"f64": 1e-13, "f32": 4e-5}[real]
-    for of_device, of_cpu in zip(actual.regularizers, expected.regularizers):
+    for of_device, of_cpu in zip(actual.regularizers, expected.regularizers, strict=True):
         assert of_device.loss == pytest.approx(of_cpu.loss, rel=tolerance)
         assert_gradients(of_device.gradients, of_cpu.gradients, tolerance)
 
@@ -293,7 +293,7 @@ def test_adam_is_the_cpus(results):
     for name in PARAMETERS:
         atol = 6 * (9 + 12 * 0.03) * epsilon
         np.testing.assert_allclose(getattr(gaussians, name), getattr(expected.adam[0], name), rtol=0, atol=atol)
-    for of_device, of_cpu in zip(moments, expected.adam[1]):
+    for of_device, of_cpu in zip(moments, expected.adam[1], strict=True):
         np.testing.assert_allclose(of_device, of_cpu, rtol=0, atol=50 * epsilon * np.abs(of_cpu).max())
 
 

@@ -248,7 +248,7 @@ def test_adam_is_adam(open_splatter, seed, generator):
     first = {name: np.zeros_like(values) for name, values in expected.items()}
     second = {name: np.zeros_like(values) for name, values in expected.items()}
     for step in range(1, 7):
-        rates = dict(zip(PARAMETERS, (1e-3, 2e-4, 1e-3, 3e-2) if step > 2 else (1e-3, 0.0, 0.0, 0.0)))
+        rates = dict(zip(PARAMETERS, (1e-3, 2e-4, 1e-3, 3e-2) if step > 2 else (1e-3, 0.0, 0.0, 0.0), strict=True))
         for name in PARAMETERS:
             g = generator.normal(size=expected[name].shape) * 1e-4
             field = getattr(splatter.fields, name).grad
@@ -260,7 +260,7 @@ def test_adam_is_adam(open_splatter, seed, generator):
         splatter.update(step, *rates.values())
     for name in PARAMETERS:
         np.testing.assert_allclose(getattr(splatter.fields.gaussians(), name), expected[name], rtol=1e-12, atol=1e-14)
-    for moments, twin in zip(splatter.fields.moments(), (first, second)):
+    for moments, twin in zip(splatter.fields.moments(), (first, second), strict=True):
         flat = np.concatenate([twin[name].reshape(30, -1) for name in PARAMETERS], axis=1)
         np.testing.assert_allclose(moments, flat, rtol=1e-12, atol=1e-18)
 

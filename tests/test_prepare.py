@@ -93,7 +93,7 @@ def test_images_alone_are_enough(prepare, tmp_path, rendered):
 
 @pytest.mark.slow(reason="calibrates many views")
 def test_named_edge_maps_go_before_images(prepare):
-    facts, views, _ = prepare({"edges": "edge_test"})
+    facts, _views, _ = prepare({"edges": "edge_test"})
     assert facts["detector"] == "maps" and facts["line_width_px"] > 1
     assert prepare({"edges": "edge_test", "detector": "subpixel"})[0]["detector"] == "subpixel"
 

@@ -193,7 +193,7 @@ def test_field_of_view_has_its_centre_between_the_middle_pixels(nerf):
 
 
 def test_emap_accepts_4x4_intrinsics(emap, block):
-    for frame, lens in zip(emap.content["frames"], block[0]):
+    for frame, lens in zip(emap.content["frames"], block[0], strict=True):
         larger = np.eye(4)
         larger[:3, :3] = lens
         frame["intrinsics"] = larger.tolist()

@@ -20,7 +20,7 @@ def box(lean=0.0):
     """The twelve edges of a box, of which one upright leans over by an angle, as a Wireframe."""
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * [0.25, 0.2, 0.15]
     corners[1] += [0.3 * np.tan(lean), 0.0, 0.0]  # the upper end of the upright at -x, -y
-    pairs = [(a, b) for a, b in combinations(range(8), 2) if bin(a ^ b).count("1") == 1]
+    pairs = [(a, b) for a, b in combinations(range(8), 2) if (a ^ b).bit_count() == 1]
     vertices = corners @ TURN.T + 0.5
     edges = tuple(Edge(Line(vertices[list(pair)]), pair) for pair in pairs)
     return Wireframe(vertices, edges, np.zeros((0, 2), np.int64))
@@ -74,7 +74,7 @@ def test_noisy_box_becomes_exactly_rectangular(taichi, generator, errors):
 def test_leaning_edge_is_left_alone(taichi, generator, errors):
     true = box(lean=np.radians(2.0))
     matching, noisy = seen(true, generator, errors=errors)
-    regular, counts = regularised(noisy, matching)
+    regular, _counts = regularised(noisy, matching)
     expected = from_right(true)
     np.testing.assert_allclose(from_right(regular), expected, atol=np.radians(0.1))
     assert (from_right(regular)[expected == 0] < 1e-6).mean() > 0.5  # the rest of the box is made exact

@@ -80,7 +80,7 @@ def test_distances_are_exact_to_a_quarter_pixel(generator):
     maps = (generator.random((3, 40, 60)) > 0.995).astype(np.uint8) * 128
     maps[:, 20, 30] = 128
     rows, columns = np.indices((40, 60))
-    for edge_map, found in zip(maps, voting.distance_maps(maps, 0.5, threads=2)):
+    for edge_map, found in zip(maps, voting.distance_maps(maps, 0.5, threads=2), strict=True):
         edges = np.argwhere(edge_map)
         exact = np.sqrt(((np.stack([rows, columns], axis=-1)[:, :, None] - edges) ** 2).sum(axis=-1).min(axis=2))
         # OpenCV approximates by steps of a knight and of a king: 2 % at most.
@@ -159,7 +159,7 @@ def test_nearly_best_is_what_a_dense_grid_gives(generator):
     radius = 0.1
     cells = np.floor(points / (radius / 2)).astype(int)
     best = {}
-    for cell, score in zip(map(tuple, cells.tolist()), scores):
+    for cell, score in zip(map(tuple, cells.tolist()), scores, strict=True):
         best[cell] = max(best.get(cell, 0), score)
     around = [max(best.get((x + i, y + j, z + k), 0) for i, j, k in voting.AROUND) for x, y, z in cells.tolist()]
     found = nearly_best(points, scores, radius)

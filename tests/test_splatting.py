@@ -170,9 +170,9 @@ def test_pages_hold_what_each_view_alone_would(open_splatter, seed, threads):
     counts = splatter.select_pixels(views, seeds).copy()
     together = [selected(splatter, page) for page in range(len(views))]
     assert counts[1] == 0 and len(together[1][0]) == 0
-    for page, (view, pixel_seed) in enumerate(zip(views, seeds)):
+    for page, (view, pixel_seed) in enumerate(zip(views, seeds, strict=True)):
         assert splatter.select_pixels(view, pixel_seed) == counts[page]
-        for of_page, alone in zip(together[page], selected(splatter)):
+        for of_page, alone in zip(together[page], selected(splatter), strict=True):
             np.testing.assert_array_equal(of_page, alone)
 
 
@@ -184,8 +184,8 @@ def test_maps_too_large_for_one_array_are_handed_over_by_the_page(open_splatter,
         monkeypatch.setattr(splatter_module, "MOST_ELEMENTS", most)
         splatter.select_pixels([MOSTLY_EDGES, OUTSIDE], [1, 2])
         selections.append([selected(splatter, page) for page in range(2)])
-    for one, other in zip(*selections):
-        for array, same in zip(one, other):
+    for one, other in zip(*selections, strict=True):
+        for array, same in zip(one, other, strict=True):
             np.testing.assert_array_equal(array, same)
 
 
@@ -358,7 +358,7 @@ def hidden_pixels(scene, view, points):
     pixels = (seen / seen[:, 2:])[:, :2] @ scene.intrinsics[view, :2, :2].T + scene.intrinsics[view, :2, 2]
     hidden, tie = np.zeros_like(edges), (np.abs(pixels - np.floor(pixels) - 0.5) < 1e-3).any(axis=1)
     rows, columns = np.mgrid[: edges.shape[0], : edges.shape[1]]
-    for (column, row), depth in zip(np.floor(pixels + 0.5), seen[:, 2]):
+    for (column, row), depth in zip(np.floor(pixels + 0.5), seen[:, 2], strict=True):
         if depth > 0 and 0 <= column < edges.shape[1] and 0 <= row < edges.shape[0]:
             window = (np.abs(columns - column) <= 2) & (np.abs(rows - row) <= 2)
             if not edges[window].any():

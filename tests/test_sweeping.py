@@ -48,7 +48,10 @@ def cluttered(views, generator, strokes, length=STROKE):
         points = (middles[:, None] + steps[:, None] * along[:, None]).reshape(-1, 2)
         normals = np.repeat(np.stack([-along[:, 1], along[:, 0]], axis=1), length, axis=0)
         inside = ((points >= 0) & (points < [views.width - 1, views.height - 1])).all(axis=1)
-        own = (np.concatenate(pair) for pair in zip(views.edgels.of_view(view)[:2], (points[inside], normals[inside])))
+        own = (
+            np.concatenate(pair)
+            for pair in zip(views.edgels.of_view(view)[:2], (points[inside], normals[inside]), strict=True)
+        )
         points, normals = own
         of_views.append((points, normals, np.ones(len(points))))
     return replace(views, edgels=Edgels.of_views(of_views))
@@ -202,7 +205,7 @@ def test_best_seeds_have_most_companions_and_there_is_room_for_them(generator):
     # 300 references of 8 px each, each place in the sight of 8 views: 300 px of edges, a seed every 3 px; twice that.
     assert len(chosen) == 2 * 300 * 8 / 3 / 8
     best = {}
-    for cell, number in zip(map(tuple, cells.tolist()), companions):
+    for cell, number in zip(map(tuple, cells.tolist()), companions, strict=True):
         best[cell] = max(best.get(cell, 0), number)
     expected = np.sort(list(best.values()))[::-1][: len(chosen)]
     np.testing.assert_array_equal(np.sort(companions[chosen])[::-1], expected)

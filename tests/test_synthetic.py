@@ -126,7 +126,7 @@ def test_faces_that_do_not_close_are_refused():
 def test_ring_cameras_have_the_whole_cube_in_view_from_above_and_below():
     corners = np.array(list(np.ndindex(2, 2, 2)), dtype=float)
     lenses, poses = ring_cameras(9, SIZE)
-    for lens, pose in zip(lenses, poses):
+    for lens, pose in zip(lenses, poses, strict=True):
         pixels, depths = project(corners, lens, pose)
         assert (depths > 0).all() and (pixels > -0.5).all() and (pixels < SIZE - 0.5).all()
         np.testing.assert_allclose(project(np.full((1, 3), 0.5), lens, pose)[0], (SIZE - 1) / 2, atol=1e-9)
@@ -140,7 +140,7 @@ def test_block_shows_nine_of_its_twelve_edges(parts):
     low, high = parts["block"].vertices.min(axis=0), parts["block"].vertices.max(axis=0)
     faces_seen = [((camera_centre(pose) < low) | (camera_centre(pose) > high)).sum() for pose in poses]
     assert faces_seen.count(3) >= 3
-    for edge_map, lens, pose, faces in zip(maps, lenses, poses, faces_seen):
+    for edge_map, lens, pose, faces in zip(maps, lenses, poses, faces_seen, strict=True):
         samples, pixels, visible = visible_samples(parts["block"], lens, pose)
         share = np.bincount(samples.strokes, visible) / np.bincount(samples.strokes)
         expected = {2: 7, 3: 9}[faces]
@@ -156,11 +156,11 @@ def test_drawn_edges_are_centred_on_the_projected_curves(parts, name):
     maps, (lenses, poses) = edge_maps_of(parts[name], view_count=3)
     across = np.arange(-4, 4.01, 0.25)
     errors = []
-    for edge_map, lens, pose in zip(maps, lenses, poses):
+    for edge_map, lens, pose in zip(maps, lenses, poses, strict=True):
         samples, pixels, visible = visible_samples(parts[name], lens, pose)
         pixels, strokes = pixels[visible], samples.strokes[visible]
         chosen = np.arange(0, len(pixels), 7)
-        for index, near in zip(chosen, cKDTree(pixels).query_ball_point(pixels[chosen], 9.0)):
+        for index, near in zip(chosen, cKDTree(pixels).query_ball_point(pixels[chosen], 9.0), strict=True):
             offsets = pixels[near] - pixels[index]
             tangent = np.linalg.eigh(offsets.T @ offsets)[1][:, 1]
             normal = np.array([-tangent[1], tangent[0]])
@@ -184,7 +184,7 @@ def test_edges_and_contours_together_outline_the_part(parts, name):
     without, _ = edge_maps_of(parts[name], view_count=4)
     pictures = render_pictures(parts[name], *cameras, SIZE)
     share_without = []
-    for edge_map, bare, picture in zip(maps, without, pictures):
+    for edge_map, bare, picture in zip(maps, without, pictures, strict=True):
         covered = (picture.min(axis=2) < 250).astype(np.uint8)
         outline = (covered - cv2.erode(covered, np.ones((3, 3), np.uint8))) > 0
         assert distance_transform_edt(edge_map < 128)[outline].max() < 2.5

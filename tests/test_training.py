@@ -341,5 +341,5 @@ def test_the_same_seed_trains_the_same_gaussians(start_taichi, block):
     schedule = {"only_means": 0.4, "regularize_from": 0.6, "regularize_every": 3, "flanks_from": 0.5}
     config = paper_training(epochs=8, gaussians=1500, density=density, established_support=0.1, **schedule)
     runs = [train(start_taichi, block, config) for _ in range(2)]
-    for one, other in zip(vars(runs[0][1]).values(), vars(runs[1][1]).values()):
+    for one, other in zip(vars(runs[0][1]).values(), vars(runs[1][1]).values(), strict=True):
         assert one.tobytes() == other.tobytes()

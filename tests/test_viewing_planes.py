@@ -127,7 +127,7 @@ def test_matching_does_not_depend_on_threads(start_taichi, generator):
         matching = EdgelMatching(views)
         refined = refine_points(matching, points, along)
         found.append((refined.points, refined.support, *matching.matches(points, along, slice(3, 9), 2.0)))
-    for one, other in zip(*found):
+    for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -155,7 +155,7 @@ def test_matches_are_the_nearest_edgels_brute_force(taichi, generator):
     views = views_of([A, RIM], generator, noise_px=1.0, count=4)
     points, along = displaced(A, 60, 3 * pixel_of(views), generator)
     matches, residuals, inside = EdgelMatching(views).matches(points, along, slice(0, 4), 3.0)
-    assert inside.all() and CELL >= max(RADII_PX)
+    assert inside.all() and max(RADII_PX) <= CELL
     for view in range(4):
         pixels, _ = views.project(points, view)
         ahead, _ = views.project(points + 1e-4 * along, view)
@@ -246,7 +246,7 @@ def noisy_means(curves, generator, views, count=300, unseen=None):
 
     unseen: a curve that has no points, so no strays by chance either.
     """
-    points, along = zip(*(displaced(curve, count, 0.7 * pixel_of(views), generator) for curve in curves))
+    points, along = zip(*(displaced(curve, count, 0.7 * pixel_of(views), generator) for curve in curves), strict=True)
     strays = generator.uniform(0.2, 0.8, (200, 3))
     strays = strays[distances_to(unseen, strays) > 8 * pixel_of(views) if unseen else slice(None)][:60]
     means, directions = np.concatenate([*points, strays]), np.concatenate([*along, generator.normal(size=(60, 3))])
@@ -280,7 +280,7 @@ def test_harvest_finds_an_edge_that_few_views_see(taichi, generator, errors):
     joined = []
     for view in range(len(views)):
         parts = [views.edgels.of_view(view)] + ([few.edgels.of_view(view)] if view % 5 == 0 else [])
-        joined.append([np.concatenate(arrays) for arrays in zip(*parts)])
+        joined.append([np.concatenate(arrays) for arrays in zip(*parts, strict=True)])
     object.__setattr__(views, "edgels", Edgels.of_views(joined))
     means, directions = noisy_means((A, RIM), generator, views, unseen=rare)
     found = {}

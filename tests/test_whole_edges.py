@@ -89,7 +89,9 @@ def distances_to(edges, points):
 
 @pytest.mark.parametrize(("radius", "angle"), [(0.1, 2 * np.pi), (0.1, 1.0), (0.05, 3.0), (1.0, 0.3), (1e3, 1e-3)])
 def test_an_arc_fit_from_a_poor_start_ends_on_the_arc(radius, angle):
-    points, tangents = (turned(part) - shift for part, shift in zip(circle(radius, -angle / 2, angle / 2), (0, 0.5)))
+    points, tangents = (
+        turned(part) - shift for part, shift in zip(circle(radius, -angle / 2, angle / 2), (0, 0.5), strict=True)
+    )
     middle, tangent = turned(np.array([[radius, 0, 0]]))[0], turned(np.array([[0.0, 1, 0]]))[0] - 0.5
     inward = 0.5 - turned(np.array([[1.0, 0, 0]]))[0]
     start = Arc(
@@ -193,7 +195,7 @@ def test_a_line_with_gaps_is_one(noise):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_filleted_corner_is_line_arc_line(noise, seed):
     parts = line((-0.3, -0.1, 0), (0, -0.1, 0)), circle(0.1, -np.pi / 2, 0), line((0.1, 0, 0), (0.1, 0.3, 0))
-    points, directions, part = observed(*parts, noise=noise, seed=seed)
+    points, directions, _part = observed(*parts, noise=noise, seed=seed)
     _, edges = edges_of(points, directions)
     assert len(edges.lines) == 2 and len(set(edges.curve_sources.tolist())) == 1
     to_edges, to_truth = distances_to(edges, np.concatenate([each[0] for each in parts]))
@@ -283,7 +285,7 @@ def test_the_scale_covers_the_noise_and_is_not_much_wider(noise):
     points, directions, _ = observed(*parts, circle(0.15, centre=(0, 0, 0.3)), noise=noise)
     graph = neighbor_graph(points, 10, 0.03)
     aligned = alignment(directions, graph)
-    neighbors = [row[good] for row, good in zip(graph.indices, (graph.indices >= 0) & (aligned >= 0.8))]
+    neighbors = [row[good] for row, good in zip(graph.indices, (graph.indices >= 0) & (aligned >= 0.8), strict=True)]
     scale = measured_scale(points, directions, neighbors, seed_order(points, directions, graph, aligned), 0.03)
     assert max(noise, LEAST_NOISE) <= scale.noise <= max(6 * noise, LEAST_NOISE)
 

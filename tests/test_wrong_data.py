@@ -15,7 +15,7 @@ from taichi_edges.files.ply import write_float_vertices
 from taichi_edges.views.cameras import OPENGL_TO_OPENCV, invert_pose
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
-from run import main  # noqa: E402
+from run import main
 
 VIEWS, WIDTH, HEIGHT = 6, 120, 96
 CUBE = "[[0, 0, 0], [1, 1, 1]]"
@@ -45,7 +45,7 @@ class Scene:
         self.write_pictures("color")
         frames = [
             {"rgb_path": f"v{view}.png", "camtoworld": pose.tolist(), "intrinsics": lens.tolist()}
-            for view, (pose, lens) in enumerate(zip(self.poses, self.intrinsics))
+            for view, (pose, lens) in enumerate(zip(self.poses, self.intrinsics, strict=True))
         ]
         (self.path / "meta_data.json").write_text(json.dumps({"frames": frames}))
 

@@ -150,6 +150,7 @@ def content_of(
     cell: tuple[int, int],
     picture_reader: Callable[[str], np.ndarray | None],
 ) -> Content:
+    """The Content of one row of the sheet. residuals, silhouette: (e,) of all edgels, None where unknown. limit: px."""
     assert views.edgels is not None
     part = slice(views.edgels.starts[view], views.edgels.starts[view + 1])
     points, normals, strengths = views.edgels.of_view(view)
@@ -243,6 +244,7 @@ def _magnified_edgels(content: Content, cell: tuple[int, int]) -> np.ndarray:
 
 
 def magnified_residuals(content: Content, cell: tuple[int, int]) -> np.ndarray:
+    """The cell of the magnified edgels, coloured by their residuals, (height, width, 3) uint8."""
     assert content.residuals is not None  # else there is no such column
     return _magnified(content, cell, residual_colours(content.residuals, content.limit))
 
