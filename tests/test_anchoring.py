@@ -71,6 +71,7 @@ def test_horizontals_get_the_depth_of_the_verticals(taichi, generator, seed, err
     assert Counter(found.tolist()) == Counter(range(len(level)))
 
 
+@pytest.mark.slow(reason="anchors whole façades")
 @either_errors()
 @pytest.mark.parametrize("seed", SEEDS)
 def test_pipe_in_front_of_the_wall_pulls_nothing(taichi, generator, seed, errors):
@@ -120,6 +121,7 @@ def strokes(generator, count):
     return points[inside], normals[inside], np.ones(inside.sum())
 
 
+@pytest.mark.slow(reason="anchors whole façades")
 @either_errors()
 @pytest.mark.parametrize("seed", SEEDS)
 def test_texture_that_differs_from_view_to_view_is_no_edge(taichi, generator, seed, errors):

@@ -125,6 +125,7 @@ def test_scale_prints_steps_and_exponents():
     assert [row["step"] for row in exponents] == ["cluster", "fit", "refine"]
 
 
+@pytest.mark.slow(reason="starts processes")
 def test_scripts_are_modules_too():
     assert "usage: python benchmarks/splat.py" in run("-m", "benchmarks.splat", "--help")
 

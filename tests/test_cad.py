@@ -204,6 +204,7 @@ def test_the_same_edges_give_the_same_bytes(tmp_path, write):
     assert ezdxf.options.write_fixed_meta_data_for_testing == before
 
 
+@pytest.mark.slow(reason="starts processes")
 @pytest.mark.parametrize("suffix", [".dxf", ".step"])
 def test_the_same_edges_give_the_same_bytes_in_every_process(tmp_path, suffix):
     """Python orders sets of strings by a random number of the process."""

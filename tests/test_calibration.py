@@ -157,6 +157,7 @@ def test_planted_shift_and_offset_are_found_and_corrected(part, generator, image
     assert np.isfinite(found.residuals).mean() > 0.5  # points that few of the views see explain nothing
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_with_images_the_rims_of_through_holes_are_corrected_too(part, generator):
     views, edgels = planted(part, SHIFT, OFFSET)
     _, found = calibrate(views, edgels, *seeds(part, generator))
@@ -165,6 +166,7 @@ def test_with_images_the_rims_of_through_holes_are_corrected_too(part, generator
     assert silhouettes > 1.03 * (without.on_silhouette > 0.9).sum()
 
 
+@pytest.mark.slow(reason="calibrates many views")
 @pytest.mark.parametrize("images", [True, False])
 def test_without_bias_nothing_moves(part, generator, images):
     views, edgels = planted(part, images=images)
@@ -175,6 +177,7 @@ def test_without_bias_nothing_moves(part, generator, images):
     np.testing.assert_array_equal(corrected.points, edgels.points)
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_opaque_pictures_measure_the_shift_but_never_the_silhouettes(part, generator, tmp_path):
     views, edgels = planted(part, SHIFT, OFFSET)
     paths = tuple(str(tmp_path / f"{view}.png") for view in range(VIEWS))
@@ -186,6 +189,7 @@ def test_opaque_pictures_measure_the_shift_but_never_the_silhouettes(part, gener
     assert found.silhouette_method == "points"
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_given_values_are_taken_and_zeros_switch_off(part, generator):
     views, edgels = planted(part, SHIFT, OFFSET)
     corrected, found = calibrate(views, edgels, *seeds(part, generator), fixed_shift=(2.0, -1.0), fixed_silhouette=0.0)
@@ -197,6 +201,7 @@ def test_given_values_are_taken_and_zeros_switch_off(part, generator):
     assert found.silhouette == pytest.approx(OFFSET, abs=0.1)
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_too_few_points_and_no_images_leave_the_edgels_alone(part, generator):
     views, edgels = planted(part, SHIFT, OFFSET, images=False)
     points, directions = seeds(part, generator)
@@ -209,6 +214,7 @@ def test_too_few_points_and_no_images_leave_the_edgels_alone(part, generator):
     assert found.silhouette_applied and not np.array_equal(corrected.points, edgels.points)
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_points_that_the_views_do_not_agree_on_say_nothing(part, generator, monkeypatch):
     views, edgels = planted(part, SHIFT, OFFSET, images=False)
     monkeypatch.setattr(consensus_module, "MOST_RESIDUAL", 0.001)
@@ -216,6 +222,7 @@ def test_points_that_the_views_do_not_agree_on_say_nothing(part, generator, monk
     assert "agree on 3D points to" in found.reason and not found.shift_applied and not found.silhouette_applied
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_errors_through_points_cover_cameras_that_are_a_little_wrong(part, generator):
     views, edgels = planted(part, SHIFT, OFFSET, images=False)
     cameras = generator.normal(0, 0.1, (VIEWS, 2))
@@ -257,6 +264,7 @@ def test_chance_pairs_between_thin_bars_are_no_bias(generator):
     np.testing.assert_array_equal(corrected.points, edgels.points)
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_contours_of_a_slim_shaft_are_no_bias(generator):
     # Seen from anywhere a contour lies the radius, some pixels, outside the axis.
     views, edgels, *seeds = unbiased("shaft", generator, size=400, smooth=1000)
@@ -265,6 +273,7 @@ def test_contours_of_a_slim_shaft_are_no_bias(generator):
     np.testing.assert_array_equal(corrected.points, edgels.points)
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_images_that_show_other_edges_than_the_maps_say_nothing(part, generator):
     views, edgels = planted(part, SHIFT, OFFSET)
     assert calibrate(views, edgels, *seeds(part, generator))[1].shift_method == "images"
@@ -273,6 +282,7 @@ def test_images_that_show_other_edges_than_the_maps_say_nothing(part, generator)
     assert "images" not in (found.shift_method, found.silhouette_method)
 
 
+@pytest.mark.slow(reason="calibrates many views")
 @pytest.mark.parametrize("leaked", [0, 3])
 def test_silhouettes_of_views_whose_background_leaked_do_not_count(part, generator, leaked):
     values, views, edgels = np.array([OFFSET, *SHIFT]), *planted(part, images=False)
@@ -288,6 +298,7 @@ def test_silhouettes_of_views_whose_background_leaked_do_not_count(part, generat
     np.testing.assert_allclose(fit_offsets(kept, UNKNOWN, len(consensus.points)).values, values, atol=0.03)
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_maps_without_edges_are_no_problem(part, generator):
     views, _ = planted(part, images=True)
     empty = replace(views, edge_maps=np.zeros_like(views.edge_maps))
@@ -451,6 +462,7 @@ def test_the_two_directions_across_are_orthonormal(generator):
     np.testing.assert_allclose(frames @ frames.transpose(0, 2, 1), np.tile(np.eye(3), (50, 1, 1)), atol=1e-12)
 
 
+@pytest.mark.slow(reason="calibrates many views")
 def test_points_move_to_where_the_edgels_are(part, generator):
     views, edgels = planted(part, images=False)
     sides = sides_of(views, edgels)

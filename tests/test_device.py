@@ -22,6 +22,7 @@ def test_only_a_lock_that_nobody_can_hold_any_more_is_removed(tmp_path, age, sta
     assert lock.exists() == stays and kernel.exists()
 
 
+@pytest.mark.slow(reason="starts processes")
 @pytest.mark.parametrize("folder", ["/proc/nowhere", "taken/kernels"])
 def test_without_a_place_for_the_cache_the_kernels_run_all_the_same(tmp_path, folder):
     (tmp_path / "taken").write_text("a file where the folder should be")

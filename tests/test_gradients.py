@@ -195,6 +195,7 @@ def test_gradients_of_the_regularizers(open_splatter, seed, generator, count, we
     assert_gradients(gradients(splatter), gradient(loss, gaussians), 1e-7)
 
 
+@pytest.mark.slow(reason="has a slow twin")
 def test_regularizers_and_image_loss_add_up(open_splatter, seed, generator):
     """Eq. 6, f32, in the sizes of a real run."""
     scene, gaussians = random_scene(seed, WIDTH, HEIGHT), random_gaussians(600, generator)
@@ -212,6 +213,7 @@ def test_regularizers_and_image_loss_add_up(open_splatter, seed, generator):
     assert_gradients(parts[2][1], total, 1e-5)
 
 
+@pytest.mark.slow(reason="has a slow twin")
 def test_orientation_pulls_neighbours_as_much_as_it_pulls_the_gaussian(open_splatter, seed, generator):
     """L_orient does not change when all points move together, so the gradients of the means sum to zero."""
     splatter = open_splatter(random_scene(seed, WIDTH, HEIGHT))

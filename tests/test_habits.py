@@ -1,17 +1,18 @@
 """What the tests hold to: public names, random numbers that can be repeated, a file for what they share."""
 
 import ast
+from functools import lru_cache
 from pathlib import Path
 
 FILES = sorted(Path(__file__).parent.glob("*.py"))
 OF_NUMPY = {"default_rng", "Generator", "SeedSequence"}  # all else in numpy.random is of one hidden state
 
 
+@lru_cache
 def nodes():
     """(file:line, node) of everything in the tests."""
-    for path in FILES:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            yield f"{path.name}:{getattr(node, 'lineno', 0)}", node
+    trees = {path.name: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
+    return [(f"{name}:{getattr(node, 'lineno', 0)}", node) for name, tree in trees.items() for node in ast.walk(tree)]
 
 
 def is_private(name):
@@ -22,7 +23,7 @@ def names_of_others(node):
     """What an expression names in other modules: imported, as an attribute, or patched as text."""
     if isinstance(node, ast.ImportFrom):
         return [alias.name for alias in node.names]
-    if isinstance(node, ast.Attribute) and ast.unparse(node.value) not in ("self", "cls"):
+    if isinstance(node, ast.Attribute) and not (isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")):
         return [node.attr]
     if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("setattr"):
         words = [word.value for word in node.args if isinstance(word, ast.Constant) and isinstance(word.value, str)]
@@ -40,8 +41,8 @@ def test_no_random_number_is_without_a_seed():
     for place, node in nodes():
         if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("default_rng") and not node.args:
             found.append(place)
-        if isinstance(node, ast.Attribute) and ast.unparse(node.value) in ("np.random", "numpy.random"):
-            found += [place] * (node.attr not in OF_NUMPY)
+        if isinstance(node, ast.Attribute) and node.attr not in OF_NUMPY and ast.unparse(node.value) == "np.random":
+            found.append(place)
         if isinstance(node, ast.Import):
             found += [place for alias in node.names if alias.name == "random"]
     assert found == []

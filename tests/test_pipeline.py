@@ -603,6 +603,7 @@ def test_given_points_are_refused_when_there_is_none_to_use(copied, tmp_path):
     assert "does not exist" in refused(copied, settings=[f"source.points={tmp_path}/nowhere.ply"])
 
 
+@pytest.mark.slow(reason="starts processes")
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

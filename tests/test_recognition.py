@@ -192,6 +192,7 @@ def run(*arguments, cwd):
     return subprocess.run(command, capture_output=True, check=False, text=True, cwd=cwd, timeout=120)
 
 
+@pytest.mark.slow(reason="starts processes")
 def test_a_folder_runs_without_a_scene_file(tmp_path):
     """It gets as far as the poses, which are missing; the log says what it was read as."""
     build(tmp_path / "my scene", "meta_data.json", "color/a.png")
@@ -201,6 +202,7 @@ def test_a_folder_runs_without_a_scene_file(tmp_path):
     assert "a frame without rgb_path" in done.stderr
 
 
+@pytest.mark.slow(reason="starts processes")
 def test_an_unknown_folder_and_an_unknown_file_end_with_one_line(tmp_path):
     build(tmp_path, "empty/notes.txt", "other.json")
     for given in ("empty", "other.json"):

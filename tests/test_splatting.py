@@ -189,6 +189,7 @@ def test_maps_too_large_for_one_array_are_handed_over_by_the_page(open_splatter,
             np.testing.assert_array_equal(array, same)
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 def test_loss_and_gradients_are_those_of_the_page(open_splatter, seed, generator):
     splatter = open_splatter(random_scene(seed, WIDTH, HEIGHT))
     gaussians = random_gaussians(300, generator)
@@ -251,6 +252,7 @@ def test_balanced_selection_has_all_edge_pixels_and_as_many_others(open_splatter
         assert (np.sort(choices[0], axis=0) != np.sort(choices[2], axis=0)).any(), "another seed chooses others"
 
 
+@pytest.mark.slow(reason="builds the kernels of another Splatter")
 def test_background_pixels_are_drawn_alike(open_splatter, seed):
     scene = random_scene(seed, WIDTH, HEIGHT)
     splatter = open_splatter(scene)
