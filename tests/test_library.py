@@ -14,7 +14,7 @@ from told import Told
 
 import taichi_edges
 from taichi_edges import Run, UserError, evaluate, load_scene, read_edges, read_wireframe, reconstruct, run_stages
-from taichi_edges.corridor import machine
+from taichi_edges.corridor import machine, pipeline, prepare
 from taichi_edges.corridor.stages import STAGES, function_of
 from taichi_edges.scene.paths import DATA_ROOT, shipped_scenes
 
@@ -179,18 +179,19 @@ def test_what_lies_in_the_working_folder_comes_first(elsewhere):
 def test_an_edge_file_is_scored_as_its_run_was(tiny):
     _, _, found = tiny
     truth, metrics = str(found.folder / "truth.json"), found.metrics
-    for edges in (str(found.folder / "edges.json"), found.folder / "edges.json", found.wireframe):
+    path = found.folder / "edges.json"
+    for edges in (str(path), path, found.wireframe, read_edges(path), read_wireframe(path)):
         scores = evaluate(edges, truth)
         assert scores == {key: value for key, value in metrics.items() if not key.startswith("held_out")}
-    assert read_wireframe(found.folder / "edges.json")[0].edge_set().lengths.sum() == pytest.approx(
+    assert read_wireframe(found.folder / "edges.json").edge_set().lengths.sum() == pytest.approx(
         found.wireframe.edge_set().lengths.sum()
     )
 
 
 def test_scores_do_not_depend_on_the_units_of_the_frame_where_its_box_is_given(tiny, tmp_path):
     _, _, found = tiny
-    edges, _ = read_edges(found.folder / "edges.json")
-    truth, _ = read_edges(found.folder / "truth.json")
+    edges = read_edges(found.folder / "edges.json")
+    truth = read_edges(found.folder / "truth.json")
     large, path = edges.transformed(lambda points: 2000 * points - 1000), tmp_path / "truth.json"
     truth = truth.transformed(lambda points: 2000 * points - 1000)
     content = {"lines_end_pts": truth.lines.tolist(), "curves_ctl_pts": truth.curves.tolist()}
@@ -198,8 +199,15 @@ def test_scores_do_not_depend_on_the_units_of_the_frame_where_its_box_is_given(t
     scores = evaluate(large, path, box=[[-1000, -1000, -1000], [1000, 1000, 1000]])
     for key in ("accuracy_mm", "completeness_mm", "predicted_length_units"):
         assert scores[key] == pytest.approx(found.metrics[key], rel=1e-3)
-    for box in ([[0, 0, 0], [1, 1, 0]], [1, 2, 3], np.zeros((2, 3))):
-        with pytest.raises(UserError, match="box: must be two corners"):
+    for box in (
+        [[0, 0, 0], [1, 1, 0]],
+        [1, 2, 3],
+        np.zeros((2, 3)),
+        "unit",
+        [[0, 0, 0], [1, 1]],
+        [[0] * 3, [np.inf] * 3],
+    ):
+        with pytest.raises(UserError, match="box: must be two finite corners"):
             evaluate(large, path, box)
 
 
@@ -260,6 +268,29 @@ def test_what_is_installed_holds_every_file_and_the_scenes(elsewhere):
     assert {f"taichi_edges/scenes/{name}.yaml" for name in shipped_scenes()} <= installed
     code = "from taichi_edges import load_scene; print(load_scene('demo').source.part, load_scene.__code__.co_filename)"
     done = python("-c", code, cwd=elsewhere, PYTHONPATH=str(place))
+def test_what_are_no_edges_and_no_truth_is_refused(tiny, tmp_path, monkeypatch):
+    _, _, found = tiny
+    truth = found.folder / "truth.json"
+    with pytest.raises(
+        UserError, match="^edges: must be the path of an edge file, an EdgeSet or a Wireframe, not list$"
+    ):
+        evaluate([[0, 0, 0], [1, 1, 1]], truth)
+    with pytest.raises(UserError, match="^truth: must be a path, not None$"):
+        evaluate(found.wireframe, None)
+    path = tmp_path / "nan.json"
+    path.write_text('{"lines_end_pts": [[[0, 0, 0], [1, NaN, 1]]], "curves_ctl_pts": []}')
+    with pytest.raises(UserError, match=f"^{path}: line 0: its points are not finite numbers; drop it before scoring$"):
+        evaluate(path, truth)
+
+
+def test_edges_and_truth_may_lie_at_home(tiny, monkeypatch):
+    _, _, found = tiny
+    monkeypatch.setenv("HOME", str(found.folder))
+    monkeypatch.setenv("USERPROFILE", str(found.folder))
+    assert evaluate("~/edges.json", "~/truth.json")["edges"] == found.metrics["edges"]
+    assert len(read_edges("~/edges.json")) > 0 and len(read_wireframe("~/edges.json")) == len(found.wireframe)
+
+
     assert done.stdout == f"demo {place / 'taichi_edges/corridor/loading.py'}\n", done.stderr
 
 

@@ -91,4 +91,4 @@ def show(run: Run) -> None:
             raise UserError(f"{run.path(artefact)}: not there yet; --show needs the refine stage, run without --until")
     points, directions = read_oriented_points(run.path("points.ply"))
     files = [str(run.path(name)) for name in ("points.ply", "edges.ply", "edges.step", "overlays.png")]
-    show_window(points, directions, read_wireframe(run.path("edges.json"))[0], files)
+    show_window(points, directions, read_wireframe(run.path("edges.json")), files)

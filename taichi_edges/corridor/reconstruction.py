@@ -62,7 +62,7 @@ def reconstruct(
     run = open_run(scene, settings, **options, threads=threads, arch=arch, quiet=quiet)
     record = run_stages(run, start, until)
     done = stages_until(record, until)
-    wireframe = read_wireframe(run.path("edges.json"))[0] if "refine" in done else None
+    wireframe = read_wireframe(run.path("edges.json")) if "refine" in done else None
     metrics = read_facts(run.path("metrics.json")) if "evaluate" in done else None
     return Reconstruction(run, wireframe, metrics, record)
 

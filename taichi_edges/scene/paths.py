@@ -13,6 +13,8 @@ SHIPPED = INSTALLED if INSTALLED.is_dir() else BESIDE
 
 def expand(text: Path | str, origin: str) -> Path:
     """A path as the user wrote it, with `~` replaced; `origin` is where it was written, for the message."""
+    if not isinstance(text, (str, os.PathLike)):
+        raise UserError(f"{origin}: must be a path, not {text!r}")
     try:
         return Path(text).expanduser()
     except RuntimeError as error:
