@@ -225,7 +225,7 @@ def _inputs(run: Run, stage: Stage) -> dict[str, Any]:
 
 def _label(run: Run, path: Path) -> str:
     """A file's path, relative to the run's folder where it lies in it: a folder that was moved is not stale."""
-    return str(path.relative_to(run.folder)) if path.is_relative_to(run.folder) else str(path)
+    return (path.relative_to(run.folder) if path.is_relative_to(run.folder) else path).as_posix()
 
 
 def _why_stale(run: Run, record: dict[str, Any], name: str) -> tuple[str, str] | None:

@@ -40,6 +40,6 @@ def shipped_scenes() -> dict[str, Path]:
 def scene_path(text: Path | str) -> Path:
     """What the user names as a scene: a path, or the name of a scene that comes along where nothing lies there."""
     path = expand(text, "scene")
-    if path.exists() or path.name != str(path):
+    if path.name != str(path) or (path.exists() and not (path / "run.json").is_file()):
         return path
     return shipped_scenes().get(path.name.removesuffix(".yaml"), path)
