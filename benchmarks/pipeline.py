@@ -1,6 +1,7 @@
 """Whole runs: seconds, memory and metrics of every scene file, `python benchmarks/pipeline.py --preset fast paper`.
 
-Each run is the command a user types, in a process of its own, from the shell to the written exports.
+Each run is the command a user types, in a process of its own, from the shell to the written exports. On Linux
+and macOS: Windows does not tell what a process has used when it is over.
 """
 
 import argparse

@@ -100,7 +100,7 @@ def filtered(run, **settings):
     cluster.cluster(with_filter(run, **settings))
     fit.fit(run)
     views = read_views(run.path("views.npz"))
-    return read_wireframe(run.path("edges_fit.json"))[0].transformed(views.similarity.to_unit, views.similarity.scale)
+    return read_wireframe(run.path("edges_fit.json")).transformed(views.similarity.to_unit, views.similarity.scale)
 
 
 explained = partial(filtered, refine=True, grow=0.0, harvest=False)

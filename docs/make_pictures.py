@@ -53,7 +53,7 @@ def draw_points(shape, pixels, colours):
 def draw_views(folder, names, out):
     """Write the edges of the run in `folder` as each of the named views sees them, side by side."""
     views = read_views(folder / "views.npz")
-    wireframe, _ = read_wireframe(folder / "edges.json")
+    wireframe = read_wireframe(folder / "edges.json")
     wireframe = wireframe.transformed(views.similarity.to_unit, views.similarity.scale)
     panels = []
     for name in names:
@@ -74,7 +74,7 @@ def main(folder, view_name, out):
         return
     views = read_views(folder / "views.npz")
     view = views.names.index(view_name)
-    wireframe, _ = read_wireframe(folder / "edges.json")
+    wireframe = read_wireframe(folder / "edges.json")
     wireframe = wireframe.transformed(views.similarity.to_unit, views.similarity.scale)
     clusters = read_clusters(folder / "clusters.npz")
     shape = (views.height, views.width)

@@ -15,6 +15,10 @@ class UserError(Exception):
         super().__init__(" ".join(str(text).split()))
 
 
+class OptionError(UserError):
+    """A mistake in an option. Its text starts with the option's name, before which the command puts its two dashes."""
+
+
 def did_you_mean(name: object, known: Iterable[object]) -> str:
     """'; did you mean 'position'?' for the known name nearest to `name`, or '' where none is near."""
     near = difflib.get_close_matches(str(name), [str(k) for k in known], n=1, cutoff=0.5)
@@ -22,10 +26,10 @@ def did_you_mean(name: object, known: Iterable[object]) -> str:
 
 
 def refuse_unknown(option: str, value: object, what: str, known: Collection[str]) -> None:
-    """UserError where the value of an option is none of those known. what: 'stage'. None is no value, and passes."""
-    if value is not None and value not in known:
+    """OptionError where the value of an option is none of those known. what: 'stage'. None is no value, and passes."""
+    if value is not None and not (isinstance(value, str) and value in known):
         hint = f"there is {', '.join(known)}{did_you_mean(value, known)}"
-        raise UserError(f"{option} {value}: there is no such {what}; {hint}")
+        raise OptionError(f"{option} {value}: there is no such {what}; {hint}")
 
 
 def name_some(names: Iterable[object], most: int = 5) -> str:

@@ -11,7 +11,7 @@ PLAIN_INTERVAL = 10.0  # seconds between two plain lines of the same task
 
 
 class Progress:
-    """What the stages are given. This base class reports nothing: it serves library users and tests."""
+    """What the stages are given. This base class is silent; `make_progress` makes those that report."""
 
     def say(self, text: str) -> None:
         """One line of information."""

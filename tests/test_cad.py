@@ -212,7 +212,7 @@ def test_the_same_edges_give_the_same_bytes_in_every_process(tmp_path, suffix):
     code = (
         "import sys; from taichi_edges.exporters import EXPORTERS; "
         "from taichi_edges.geometry.wireframe import read_wireframe; "
-        f"[EXPORTERS[{suffix!r}](path, read_wireframe(sys.argv[1])[0]) for path in sys.argv[2:]]"
+        f"[EXPORTERS[{suffix!r}](path, read_wireframe(sys.argv[1])) for path in sys.argv[2:]]"
     )
     written = set()
     for number in ("1", "4"):  # ezdxf's own order differs between these
@@ -290,7 +290,7 @@ def test_a_part_of_a_file_without_vertices_goes_through_both(tmp_path, name):
     """As EMAP's files are: pieces that share a number are a chain."""
     import ezdxf
 
-    part, _ = read_wireframe(write_edges(tmp_path / "truth.json", PARTS[name]().edges, {}))
+    part = read_wireframe(write_edges(tmp_path / "truth.json", PARTS[name]().edges, {}))
     edges, _ = read_step(write_step(tmp_path / "edges.step", part))
     entities = list(ezdxf.readfile(write_dxf(tmp_path / "edges.dxf", part)).modelspace())
     for edge, entity, shape in zip(edges, entities, part.shapes, strict=True):

@@ -326,7 +326,7 @@ def test_edges_come_out_in_the_frame_and_scale_of_colmap(part_project, tmp_path)
     assert facts["box_from"] == "reader"
     low, high = np.array(facts["box"])
     assert (low < truth.min(axis=0)).all() and (high > truth.max(axis=0)).all()
-    edges, _about = read_edges(run.path("edges.json"))
+    edges = read_edges(run.path("edges.json"))
     found = edges.sample(0.2)[0]
     away = np.linalg.norm(found[:, None] - truth[None], axis=2)
     # 40 units are the unit cube; a pixel is 0.17 units. The block has 12 edges.

@@ -10,6 +10,7 @@ import pytest
 
 from taichi_edges.corridor.pipeline import Run
 from taichi_edges.kernels.device import STALE_LOCK, download, is_running, release_cache, upload
+from taichi_edges.scene.settings import SceneConfig
 
 
 @pytest.mark.parametrize("age, stays", [(0.5 * STALE_LOCK, True), (2 * STALE_LOCK, False)])
@@ -36,13 +37,15 @@ def test_without_a_place_for_the_cache_the_kernels_run_all_the_same(tmp_path, fo
 
 def test_a_cache_that_is_not_there_yet_needs_nothing(tmp_path):
     release_cache(tmp_path / "nowhere")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_each_pair_of_versions_has_a_cache_of_its_own(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    folder = Run(None, tmp_path).kernel_cache
+    config = SceneConfig(source={"reader": "synthetic"})
+    folder = Run(config, tmp_path).kernel_cache
     monkeypatch.setattr("taichi_edges.corridor.pipeline.version", lambda package: "9.9")
-    other = Run(None, tmp_path).kernel_cache
+    other = Run(config, tmp_path).kernel_cache
     assert folder != other and folder.is_relative_to(tmp_path) and "9.9" in other.name
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.distance import cdist
 from taichi_edges.errors import UserError
 from taichi_edges.fitting.cubic_chains import BENDING, lsq_chain, nearest_on_chain
 from taichi_edges.geometry.bezier import LENGTH_SEGMENTS, bernstein, bezier_lengths, evaluate_bezier
-from taichi_edges.geometry.edge_set import EdgeSet, read_edges, write_edges
+from taichi_edges.geometry.edge_set import EdgeSet, edges_and_about, read_edges, write_edges
 from taichi_edges.points.filtering import filter_points, statistical_inliers
 from taichi_edges.scene.settings import ClusterConfig, FilterConfig, FitConfig
 from taichi_edges.strokes.cluster_fits import fit_cluster, fit_curve, fit_line, wireframe_of
@@ -495,7 +495,7 @@ def test_samples_of_no_edges_are_empty():
 def test_edges_come_back_bit_for_bit(generator, tmp_path):
     edges = some_edges(generator)
     path = write_edges(tmp_path / "edges.json", edges, {"frame": "input", "seed": 3})
-    again, about = read_edges(path)
+    again, about = edges_and_about(path)
     for name in ("lines", "curves", "line_sources", "curve_sources"):
         np.testing.assert_array_equal(getattr(again, name), getattr(edges, name))
     assert about == {"frame": "input", "seed": 3}
@@ -504,7 +504,7 @@ def test_edges_come_back_bit_for_bit(generator, tmp_path):
 
 
 def test_no_edges_come_back_too(tmp_path):
-    again, _ = read_edges(write_edges(tmp_path / "edges.json", EdgeSet.of(), {}))
+    again = read_edges(write_edges(tmp_path / "edges.json", EdgeSet.of(), {}))
     assert again.lines.shape == (0, 2, 3) and again.curves.shape == (0, 4, 3) and len(again) == 0
 
 

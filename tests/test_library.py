@@ -2,11 +2,13 @@
 
 import configparser
 import json
+import ntpath
 import subprocess
 import sys
 from dataclasses import FrozenInstanceError
 from importlib import import_module
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from told import Told
 
 import taichi_edges
 from taichi_edges import Run, UserError, evaluate, load_scene, read_edges, read_wireframe, reconstruct, run_stages
-from taichi_edges.corridor import machine
+from taichi_edges.corridor import machine, pipeline, prepare
 from taichi_edges.corridor.stages import STAGES, function_of
 from taichi_edges.scene.paths import DATA_ROOT, shipped_scenes
 
@@ -103,16 +105,30 @@ def test_a_run_takes_strings_makes_its_folder_and_reports(elsewhere, capsys):
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
-        ({"start": "fti"}, "--stage fti: there is no such stage; there is prepare, .*export; did you mean 'fit'?"),
-        ({"until": "exprot"}, "--until exprot: there is no such stage; .*; did you mean 'export'?"),
-        ({"arch": "gpu"}, "--arch gpu: there is no such device; there is cpu, cuda, vulkan"),
-        ({"threads": 0}, "--threads 0: must be at least 1"),
-        ({"preset": "papre"}, "--preset papre: there is no such preset; .*; did you mean 'paper'?"),
+        ({"start": "fti"}, "^start fti: there is no such stage; there is prepare, .*export; did you mean 'fit'?"),
+        ({"until": "exprot"}, "^until exprot: there is no such stage; .*; did you mean 'export'?"),
+        ({"arch": "gpu"}, "^arch gpu: there is no such device; there is cpu, cuda, vulkan"),
+        ({"start": ["fit"]}, r"^start \['fit'\]: there is no such stage"),
+        (
+            {"start": "refine", "until": "fit"},
+            "^refine comes after fit, so there is nothing to run; the order is prepare",
+        ),
+        (
+            {"stage": "fit"},
+            "stage='fit': stage: unknown key; the stage to start with is .* the argument start from Python",
+        ),
+        ({"show": True}, "show=True: show: unknown key; the window is opened by the command line alone, with --show"),
+        ({"threads": 0}, "^threads 0: must be at least 1"),
+        ({"threads": "4"}, "^threads '4': must be a whole number"),
+        ({"threads": 2.5}, "^threads 2.5: must be a whole number"),
+        ({"out": None}, "^out: must be a path, not None"),
+        ({"data": 3}, "^data: must be a path, not 3"),
+        ({"preset": "papre"}, "^preset papre: there is no such preset; .*; did you mean 'paper'?"),
         ({"train": {"step": 3}}, r"train={'step': 3}: train.step: unknown key; did you mean 'steps'\?"),
         ({"train.steps": "many"}, r"train.steps='many': train.steps: must be a whole number"),
         ({"steps": 3}, "steps=3: steps: unknown key; did you mean 'train.steps'?"),
-        ({"seed": -1}, "--seed -1: seed: must be at least 0"),
-        ({"data": "nowhere"}, "--data: nowhere is not a folder"),
+        ({"seed": -1}, "^seed -1: seed: must be at least 0"),
+        ({"data": "nowhere"}, "^data: nowhere is not a folder"),
     ],
 )
 def test_mistakes_are_errors_of_the_user_and_leave_nothing_behind(elsewhere, wrong, says):
@@ -121,12 +137,35 @@ def test_mistakes_are_errors_of_the_user_and_leave_nothing_behind(elsewhere, wro
     assert list(elsewhere.iterdir()) == []
 
 
+def test_what_is_no_scene_and_no_run_is_refused_at_once(elsewhere):
+    for nothing in (None, 3):
+        with pytest.raises(UserError, match=f"^scene: must be a path, not {nothing}$"):
+            reconstruct(nothing)
+    with pytest.raises(UserError, match="^config: must be what load_scene returns, not 'demo'$"):
+        Run("demo", "results")
+    with pytest.raises(UserError, match="^folder: must be a path, not None$"):
+        Run(load_scene("demo"), None)
+    with pytest.raises(UserError, match="^data_root: nowhere is not a folder"):
+        Run(load_scene("demo"), "results", data_root="nowhere")
+    assert type(Run(load_scene("demo"), "results", threads=np.int64(2)).threads) is int
+
+
+def test_files_inside_the_run_are_called_the_same_on_every_system(monkeypatch):
+    folder = PureWindowsPath("C:/runs/demo")
+    assert pipeline._label(SimpleNamespace(folder=folder), folder / "images" / "a.png") == "images/a.png"
+    assert pipeline._label(SimpleNamespace(folder=folder), PureWindowsPath("C:/data/a.png")) == "C:/data/a.png"
+    monkeypatch.setattr(prepare, "Path", PureWindowsPath)
+    monkeypatch.setattr(prepare, "os", SimpleNamespace(path=ntpath))
+    assert prepare._relative(r"C:\runs\demo\images\a.png", str(folder)) == "images/a.png"
+    assert prepare._relative(r"C:\data\a.png", str(folder)) == r"C:\data\a.png" and prepare._relative("", "C:/") == ""
+
+
 def test_settings_may_be_sections_or_keys(elsewhere):
     nested = load_scene("demo", settings={"train": {"epochs": 3}, "source": {"views": 5}})
     assert nested == load_scene("demo", settings=["train.epochs=3", "source.views=5"])
     assert nested == load_scene("demo", settings={"train.epochs": 3, "source.views": 5})
     assert (nested.train.epochs, nested.train.steps) == (3, 0)
-    with pytest.raises(UserError, match="a preset brings many values with it"):
+    with pytest.raises(UserError, match="a preset brings many values with it; give it as the argument preset"):
         load_scene("demo", settings={"preset": "paper"})
 
 
@@ -173,24 +212,36 @@ def test_what_lies_in_the_working_folder_comes_first(elsewhere):
     assert load_scene("demo").source.path == str(elsewhere / "demo")
 
 
+def test_the_results_of_a_scene_in_the_working_folder_are_not_its_source(elsewhere):
+    small = {"source.part": "block", "source.views": 3, "source.size": 64, "out": ".", "threads": 2, "quiet": True}
+    first = reconstruct("demo", until="prepare", **small)
+    assert (elsewhere / "demo/run.json").is_file()
+    again = reconstruct("demo", until="prepare", **small)
+    assert again.run.config == first.run.config and again.record["ran"] == []
+    (elsewhere / "mine").mkdir()
+    (elsewhere / "mine/run.json").write_text("{}")
+    assert load_scene("mine").source.path == str(elsewhere / "mine")  # no scene that comes along
+
+
 # ------------------------------------------------------------------------------------------------------------- scores
 
 
 def test_an_edge_file_is_scored_as_its_run_was(tiny):
     _, _, found = tiny
     truth, metrics = str(found.folder / "truth.json"), found.metrics
-    for edges in (str(found.folder / "edges.json"), found.folder / "edges.json", found.wireframe):
+    path = found.folder / "edges.json"
+    for edges in (str(path), path, found.wireframe, read_edges(path), read_wireframe(path)):
         scores = evaluate(edges, truth)
         assert scores == {key: value for key, value in metrics.items() if not key.startswith("held_out")}
-    assert read_wireframe(found.folder / "edges.json")[0].edge_set().lengths.sum() == pytest.approx(
+    assert read_wireframe(found.folder / "edges.json").edge_set().lengths.sum() == pytest.approx(
         found.wireframe.edge_set().lengths.sum()
     )
 
 
 def test_scores_do_not_depend_on_the_units_of_the_frame_where_its_box_is_given(tiny, tmp_path):
     _, _, found = tiny
-    edges, _ = read_edges(found.folder / "edges.json")
-    truth, _ = read_edges(found.folder / "truth.json")
+    edges = read_edges(found.folder / "edges.json")
+    truth = read_edges(found.folder / "truth.json")
     large, path = edges.transformed(lambda points: 2000 * points - 1000), tmp_path / "truth.json"
     truth = truth.transformed(lambda points: 2000 * points - 1000)
     content = {"lines_end_pts": truth.lines.tolist(), "curves_ctl_pts": truth.curves.tolist()}
@@ -198,9 +249,39 @@ def test_scores_do_not_depend_on_the_units_of_the_frame_where_its_box_is_given(t
     scores = evaluate(large, path, box=[[-1000, -1000, -1000], [1000, 1000, 1000]])
     for key in ("accuracy_mm", "completeness_mm", "predicted_length_units"):
         assert scores[key] == pytest.approx(found.metrics[key], rel=1e-3)
-    for box in ([[0, 0, 0], [1, 1, 0]], [1, 2, 3], np.zeros((2, 3))):
-        with pytest.raises(UserError, match="box: must be two corners"):
+    for box in (
+        [[0, 0, 0], [1, 1, 0]],
+        [1, 2, 3],
+        np.zeros((2, 3)),
+        "unit",
+        [[0, 0, 0], [1, 1]],
+        [[0] * 3, [np.inf] * 3],
+    ):
+        with pytest.raises(UserError, match="box: must be two finite corners"):
             evaluate(large, path, box)
+
+
+def test_what_are_no_edges_and_no_truth_is_refused(tiny, tmp_path):
+    _, _, found = tiny
+    truth = found.folder / "truth.json"
+    with pytest.raises(
+        UserError, match="^edges: must be the path of an edge file, an EdgeSet or a Wireframe, not list$"
+    ):
+        evaluate([[0, 0, 0], [1, 1, 1]], truth)
+    with pytest.raises(UserError, match="^truth: must be a path, not None$"):
+        evaluate(found.wireframe, None)
+    path = tmp_path / "nan.json"
+    path.write_text('{"lines_end_pts": [[[0, 0, 0], [1, NaN, 1]]], "curves_ctl_pts": []}')
+    with pytest.raises(UserError, match=f"^{path}: line 0: its points are not finite numbers; drop it before scoring$"):
+        evaluate(path, truth)
+
+
+def test_edges_and_truth_may_lie_at_home(tiny, monkeypatch):
+    _, _, found = tiny
+    monkeypatch.setenv("HOME", str(found.folder))
+    monkeypatch.setenv("USERPROFILE", str(found.folder))
+    assert evaluate("~/edges.json", "~/truth.json")["edges"] == found.metrics["edges"]
+    assert len(read_edges("~/edges.json")) > 0 and len(read_wireframe("~/edges.json")) == len(found.wireframe)
 
 
 def test_a_truth_with_a_frame_of_its_own_takes_no_box(tiny, tmp_path):

@@ -33,7 +33,7 @@ from taichi_edges.exporters.point_cloud import read_oriented_points
 from taichi_edges.files import artefacts
 from taichi_edges.files.artefacts import digest_file, remove_unfinished, replacing
 from taichi_edges.files.splats import read_gaussians
-from taichi_edges.geometry.edge_set import EdgeSet, read_edges, write_edges
+from taichi_edges.geometry.edge_set import EdgeSet, edges_and_about, read_edges, write_edges
 from taichi_edges.geometry.wireframe import read_wireframe
 from taichi_edges.progress import PlainProgress, TerminalProgress
 from taichi_edges.readers.points import read_points
@@ -276,12 +276,12 @@ def test_everything_exported_is_in_the_frame_of_the_input(finished, tmp_path):
     content["train"]["learning_rates"]["scales"] = 0.0  # so that the Gaussians keep the scale they start with
     (tmp_path / "large.yaml").write_text(json.dumps(content))
     succeed(command(tmp_path / "large.yaml", tmp_path / "runs", "--until", "refine"))
-    truth, _ = read_edges(runs / "tiny/truth.json")
+    truth = read_edges(runs / "tiny/truth.json")
     on_edges = cKDTree(2000 * truth.sample(0.002)[0] - 1000)
     _, log_scales, _, _ = read_gaussians(tmp_path / "runs/large/gaussians.ply")
     np.testing.assert_allclose(np.exp(log_scales), 2000 * 0.004, rtol=1e-5)
     points, _ = read_oriented_points(tmp_path / "runs/large/points.ply")
-    found, _ = read_edges(tmp_path / "runs/large/edges.json")
+    found = read_edges(tmp_path / "runs/large/edges.json")
     assert np.median(on_edges.query(points)[0]) < 2000 * 0.02  # the tiny run is rough: 0.01 in the unit cube
     assert np.median(on_edges.query(found.sample(10)[0])[0]) < 2000 * 0.02
 
@@ -293,7 +293,7 @@ def test_cad_files_hold_the_edges_of_the_run(finished):
     import ezdxf
 
     _, runs, _ = finished
-    wireframe, _ = read_wireframe(runs / "tiny/edges.json")
+    wireframe = read_wireframe(runs / "tiny/edges.json")
     edges, _ = read_step(runs / "tiny/edges.step")
     document = ezdxf.readfile(runs / "tiny/edges.dxf")
     assert not document.audit().errors and len(document.modelspace()) == len(edges) == len(wireframe)
@@ -311,7 +311,7 @@ def test_all_artefacts_are_there_and_can_be_read(finished):
     assert len(list((folder / "overlays").glob("*.png"))) == 4 and len(list((folder / "images").glob("*.png"))) == 12
     views, held_out = read_views(folder / "views.npz"), read_views(folder / "held_out.npz")
     assert len(views) == 11 and len(held_out) == 1 and not set(views.names) & set(held_out.names)
-    edges, about = read_edges(folder / "edges.json")
+    edges, about = edges_and_about(folder / "edges.json")
     assert len(edges) > 0 and about["frame"] == "input" and about["seed"] == 0
     assert (folder / "gaussians.ply").read_bytes().startswith(b"ply\n")
     log = list(csv.DictReader((folder / "train_log.csv").open()))
@@ -553,7 +553,9 @@ def test_a_refusal_changes_no_artefact(copied):
 
 
 def test_stage_after_until_is_refused(copied):
-    assert "--stage fit comes after --until train" in refused(copied, stage="fit", until="train")
+    assert "fit comes after train, so there is nothing to run; the order is prepare train" in refused(
+        copied, stage="fit", until="train"
+    )
 
 
 def test_a_mistyped_truth_is_refused_before_the_training(copied, tmp_path):
@@ -623,7 +625,10 @@ def test_given_points_are_refused_when_there_is_none_to_use(copied, tmp_path):
             "--set fit.delat=1: fit.delat: unknown key; did you mean 'delta'?",
         ),
         (["scenes/demo.yaml", "--show", "--until", "train"], "--show needs the edges"),
-        (["scenes/demo.yaml", "--stage", "fit", "--until", "train"], "--stage fit comes after --until train"),
+        (
+            ["scenes/demo.yaml", "--stage", "fit", "--until", "train"],
+            "fit comes after train, so there is nothing to run",
+        ),
     ],
 )
 def test_mistakes_end_with_status_2_and_one_line(tmp_path, arguments, says):
@@ -642,7 +647,7 @@ def test_a_device_that_is_not_there_is_refused(copied):
     if shutil.which("nvidia-smi"):
         pytest.skip("this machine has an NVIDIA driver")
     message = refuse([str(scene), "--out", str(runs), "--arch", "cuda"])
-    assert "--arch cuda: this machine offers Taichi no cuda device; use --arch cpu" in message
+    assert "--arch cuda: this machine offers Taichi no cuda device; use cpu" in message
 
 
 @pytest.mark.skipif(
@@ -715,7 +720,7 @@ def test_one_seed_gives_the_same_edges_and_another_seed_others(finished, tmp_pat
     succeed(command(scene, tmp_path, "--seed", "1", "--until", "refine"))
     other, first = tmp_path / "tiny" / "edges.json", runs / "tiny" / "edges.json"
     assert other.read_bytes() != first.read_bytes()
-    assert read_edges(other)[1]["seed"] == 1
+    assert edges_and_about(other)[1]["seed"] == 1
     assert (tmp_path / "tiny" / "gaussians.ply").read_bytes() != (runs / "tiny" / "gaussians.ply").read_bytes()
 
 

@@ -173,7 +173,7 @@ def test_stage_warns_when_no_edge_is_left(start_taichi, tmp_path, monkeypatch, g
     monkeypatch.setattr("taichi_edges.kernels.device.start_taichi", lambda *_: start_taichi("f32", 1))
     lines = [Line(np.array([[0.2, 0.3, 0.4], [0.7, 0.6, 0.5]]))] * 2
     run = run_of(tmp_path, Wireframe.loose(lines), views_of([], generator, count=4), enabled=True)
-    assert refine(run)["edges"] == 0 and len(read_wireframe(tmp_path / "edges.json")[0]) == 0
+    assert refine(run)["edges"] == 0 and len(read_wireframe(tmp_path / "edges.json")) == 0
     (text,) = run.progress.texts
     assert "the images support none of the 2 edges that were fitted" in text and "refine.enabled: false" in text
 

@@ -2,11 +2,13 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 from taichi_edges.corridor.loading import load_scene
 from taichi_edges.errors import UserError
+from taichi_edges.scene.paths import SHIPPED
 from taichi_edges.scene.presets import PRESETS, SCALES, SCALES_OF_READERS
 from taichi_edges.scene.scene_file import check_scene
 from taichi_edges.scene.settings import SceneConfig
@@ -127,6 +129,13 @@ def test_an_unknown_key_is_named_with_the_nearest_valid_one(scene, text, key, ne
 
 def test_an_unknown_key_like_no_other_lists_the_known_ones(scene):
     assert "known here: delta, line_tolerance, min_length" in refusal(scene("fit: {zzzzqq: 3}"))
+
+
+def test_a_key_that_is_gone_says_what_to_do(scene):
+    path = scene("filter: {grow_step: 0.5}")
+    assert (
+        refusal(path) == f"{path}: filter.grow_step: unknown key; it is gone, for growing goes by a pixel; leave it out"
+    )
 
 
 def test_all_mistakes_are_counted(scene):
@@ -254,6 +263,8 @@ def test_a_file_that_is_no_scene_is_named(tmp_path, content, says):
     path.write_bytes(content)
     message = refusal(path)
     assert message.startswith(f"{path}: ") and says in message
+    if "not valid YAML" not in message:
+        assert str(SHIPPED / "demo.yaml") in message  # an example that whoever installed the package has, too
 
 
 def test_a_folder_is_a_scene_without_keys(tmp_path):
@@ -327,6 +338,40 @@ def test_set_reaches_any_key(scene, setting, value):
     assert value(load_scene(scene(), settings=[setting]))
 
 
+def test_values_from_python_need_not_be_what_yaml_gives(scene):
+    box, corners = [[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]], ((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
+    for given in (box, corners, np.array(box), np.array(box, np.float32), (np.zeros(3), np.array([1.0, 2.0, 3.0]))):
+        assert load_scene(scene(), settings={"box": given}).box == box
+    settings = {"train": {"epochs": np.int64(3)}, "fit.delta": np.float64(0.25), "source.thin": np.bool_(False)}
+    config = load_scene(scene(), settings={**settings, "source.path": Path("some/where")}, seed=np.int32(5))
+    assert (config.train.epochs, config.fit.delta, config.source.thin, config.seed) == (3, 0.25, False, 5)
+    assert config.source.path == str(Path("some/where")) and yaml.safe_dump(config.model_dump())
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ("train.steps=3", "settings: must be a dict, or a list of 'key=value', not 'train.steps=3'"),
+        (None, "settings: must be a dict, or a list of 'key=value', not None"),
+        ([3], "settings: must be a dict, or a list of 'key=value', not [3]"),
+        ({3: 4}, "3=4: a key is a text, names with one dot between them, e.g. 'train.epochs'"),
+        ({"train..steps": 4}, "train..steps=4: a key is a text, names with one dot between them"),
+        ({"": 4}, "=4: a key is a text"),
+        ({"preset": {}}, "preset={}: a preset brings many values with it; give it as the argument preset"),
+        (
+            {"box": np.eye(3)},
+            "box=[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]: box: must have 2 entries, not 3",
+        ),
+    ],
+)
+def test_wrong_settings_from_python_are_named(scene, settings, says):
+    assert refusal(scene(), settings=settings).startswith(says)
+
+
+def test_a_preset_that_is_no_text_is_refused(scene):
+    assert refusal(scene(), preset={}).startswith("preset {}: there is no such preset; there is paper, fast")
+
+
 @pytest.mark.parametrize(
     ("setting", "says"),
     [
@@ -357,7 +402,7 @@ def test_a_mistake_in_the_file_is_not_blamed_on_set(scene):
 
 def test_the_seed_of_the_command_line_overrides_all(scene):
     assert load_scene(scene("seed: 3"), settings=["seed=4"], seed=5).seed == 5
-    assert refusal(scene(), seed=-1).startswith("--seed -1: ")
+    assert refusal(scene(), seed=-1).startswith("seed -1: ")
 
 
 def test_an_unknown_preset_is_refused(scene):
@@ -440,7 +485,7 @@ def test_renderings_are_parts_whose_settings_are_those_of_the_preset(scene, read
 def test_an_unknown_scale_is_refused(scene):
     assert "scale: must be 'part', 'object', 'building' or 'room', not 'city'" in refusal(scene("scale: city"))
     assert "scale: must be" in refusal(scene("scale: [room]"))
-    assert refusal(scene(), scale="city").startswith("--scale city: there is no such scale; there is part, object")
+    assert refusal(scene(), scale="city").startswith("scale city: there is no such scale; there is part, object")
     assert "use --scale room" in refusal(scene(), settings=["scale=room"])
 
 

@@ -8,10 +8,14 @@ from typing import get_args
 
 import pytest
 
+from taichi_edges.corridor.arguments import make_parser
+from taichi_edges.corridor.pipeline import ARCHS
+from taichi_edges.corridor.stages import STAGES
 from taichi_edges.detectors import DETECTORS
 from taichi_edges.exporters import EXPORTERS
+from taichi_edges.kernels.device import DEVICES
 from taichi_edges.readers import READERS
-from taichi_edges.scene.presets import SCALES_OF_READERS
+from taichi_edges.scene.presets import PRESETS, SCALES, SCALES_OF_READERS
 from taichi_edges.scene.settings import WITH_POINTS, SourceConfig
 from taichi_edges.synthetic.hard_parts import HARD_PARTS
 from taichi_edges.synthetic.parts import PARTS
@@ -36,6 +40,18 @@ def test_a_scene_can_ask_for_every_reader_and_detector():
 
 def test_presets_name_only_readers_that_there_are():
     assert set(SCALES_OF_READERS) | set(WITH_POINTS) <= {*READERS, "auto"}
+
+
+def test_the_command_line_takes_what_the_tables_hold():
+    choices = {action.dest: set(action.choices) for action in make_parser()._actions if action.choices}
+    assert choices == {
+        "stage": set(STAGES),
+        "until": set(STAGES),
+        "preset": set(PRESETS),
+        "scale": set(SCALES),
+        "arch": set(ARCHS),
+    }
+    assert set(ARCHS) == set(DEVICES)
 
 
 @pytest.mark.parametrize("name", READERS)

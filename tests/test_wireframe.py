@@ -10,7 +10,14 @@ from placed_shapes import KINDS, Placing, any_shape
 from taichi_edges.errors import UserError
 from taichi_edges.geometry.edge_set import EdgeSet, write_edges
 from taichi_edges.geometry.shapes import Line, Spline
-from taichi_edges.geometry.wireframe import Edge, Evidence, Wireframe, read_wireframe, write_wireframe
+from taichi_edges.geometry.wireframe import (
+    Edge,
+    Evidence,
+    Wireframe,
+    read_wireframe,
+    wireframe_and_about,
+    write_wireframe,
+)
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 SEEN = Evidence(7, 0.25, 0.1 + 0.2, 1 / 3)  # numbers that a few decimals would not keep
@@ -66,7 +73,7 @@ def test_no_shapes_are_an_empty_wireframe(tmp_path):
     assert len(nothing.edge_set()) == 0 and len(nothing.keep(np.zeros(0, bool))) == 0
     assert len(nothing.transformed(lambda points: points, 1.0)) == 0
     write_wireframe(tmp_path / "edges.json", nothing, {})
-    assert same(read_wireframe(tmp_path / "edges.json")[0], nothing)
+    assert same(read_wireframe(tmp_path / "edges.json"), nothing)
 
 
 def test_degree_counts_ends_and_edges_passing_by(square):
@@ -120,13 +127,13 @@ def test_similarity_moves_vertices_with_shapes_and_lengths_with_the_scale(mixed,
 
 def test_file_keeps_every_bit(mixed, tmp_path):
     write_wireframe(tmp_path / "edges.json", mixed, {"counts": {"line": 3}})
-    found, rest = read_wireframe(tmp_path / "edges.json")
+    found, rest = wireframe_and_about(tmp_path / "edges.json")
     assert same(found, mixed) and rest["counts"] == {"line": 3}
 
 
 def test_written_twice_is_the_same_file(mixed, tmp_path):
     write_wireframe(tmp_path / "one.json", mixed, {})
-    write_wireframe(tmp_path / "two.json", read_wireframe(tmp_path / "one.json")[0], {})
+    write_wireframe(tmp_path / "two.json", read_wireframe(tmp_path / "one.json"), {})
     assert (tmp_path / "one.json").read_bytes() == (tmp_path / "two.json").read_bytes()
 
 
@@ -143,7 +150,7 @@ def test_emaps_file_is_loose_edges(tmp_path, generator):
     (tmp_path / "edges.json").write_text(
         json.dumps({"lines_end_pts": lines.tolist(), "curves_ctl_pts": curves.tolist()})
     )
-    found, rest = read_wireframe(tmp_path / "edges.json")
+    found, rest = wireframe_and_about(tmp_path / "edges.json")
     assert [shape.kind for shape in found.shapes] == ["line"] * 3 + ["spline"] * 2 and not rest
     np.testing.assert_array_equal([shape.points for shape in found.shapes[:3]], lines)
     np.testing.assert_array_equal([shape.curves[0] for shape in found.shapes[3:]], curves)
@@ -155,7 +162,7 @@ def test_pieces_of_one_source_are_one_edge(tmp_path, generator):
     sources = np.repeat([7, 2], [len(chain), len(loop)])
     edges = EdgeSet(np.zeros((0, 2, 3)), np.concatenate([chain, loop]), np.zeros(0, np.int64), sources)
     write_edges(tmp_path / "edges.json", edges, {})
-    found = read_wireframe(tmp_path / "edges.json")[0]
+    found = read_wireframe(tmp_path / "edges.json")
     assert [shape.closed for shape in found.shapes] == [False, True]
     np.testing.assert_array_equal(found.shapes[0].curves, chain)
     np.testing.assert_array_equal(found.shapes[1].curves, loop)
@@ -208,7 +215,7 @@ DAMAGES = {
 
 def test_the_undamaged_file_is_read(tmp_path):
     (tmp_path / "edges.json").write_text(json.dumps(line_content()))
-    assert len(read_wireframe(tmp_path / "edges.json")[0]) == 2
+    assert len(read_wireframe(tmp_path / "edges.json")) == 2
 
 
 @pytest.mark.parametrize("damage", DAMAGES)

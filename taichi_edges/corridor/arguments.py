@@ -9,7 +9,7 @@ from typing import NoReturn
 
 import taichi_edges
 from taichi_edges.corridor.stages import STAGES
-from taichi_edges.errors import UserError
+from taichi_edges.errors import OptionError, UserError
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -20,8 +20,8 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"error: {message}; see {self.prog} --help\n")
 
 
-def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespace:
-    """The options of the command line; None for that of this process."""
+def make_parser() -> OneLineParser:
+    """The parser of the command line. It repeats names from tables that take long to import."""
     parser = OneLineParser(
         prog="python -m taichi_edges" if Path(sys.argv[0]).name == "__main__.py" else None,
         description=f"Recover the 3D edges of a scene: {', '.join(STAGES)}.",
@@ -43,7 +43,12 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespac
     parser.add_argument("--show", action="store_true", help="at the end, show points and edges in a window")
     parser.add_argument("--quiet", action="store_true", help="no progress, only warnings and the final summary")
     parser.add_argument("--version", action="version", version=f"taichi-edges {taichi_edges.__version__}")
-    return parser.parse_args(arguments)
+    return parser
+
+
+def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """The options of the command line; None for that of this process."""
+    return make_parser().parse_args(arguments)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -57,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         run_command(options)
         sys.stdout.flush()
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {'--' if isinstance(error, OptionError) else ''}{error}", file=sys.stderr)
         return 2
     except BrokenPipeError:  # the reader of the summary has closed it, as `| head` does; all artefacts are written
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -8,6 +8,7 @@ from taichi_edges.corridor.pipeline import Run, run_stages
 from taichi_edges.corridor.reconstruction import open_run, stages_until
 from taichi_edges.corridor.stages import STAGES
 from taichi_edges.errors import UserError
+from taichi_edges.scene.paths import data_folder, expand
 
 if TYPE_CHECKING:
     from argparse import Namespace
@@ -17,6 +18,7 @@ def run_command(options: "Namespace") -> None:
     """Run what the parsed command line `options` asks for; mistakes of the user raise UserError."""
     if options.show:
         _refuse_vain_show(options.until)
+    options.data, options.out = data_folder(options.data, "--data"), expand(options.out, "--out")
     names = ("out", "data", "preset", "scale", "seed", "threads", "arch", "quiet")
     run = open_run(options.scene, options.set, **{name: getattr(options, name) for name in names})
     record = run_stages(run, options.stage, options.until)
@@ -91,4 +93,4 @@ def show(run: Run) -> None:
             raise UserError(f"{run.path(artefact)}: not there yet; --show needs the refine stage, run without --until")
     points, directions = read_oriented_points(run.path("points.ply"))
     files = [str(run.path(name)) for name in ("points.ply", "edges.ply", "edges.step", "overlays.png")]
-    show_window(points, directions, read_wireframe(run.path("edges.json"))[0], files)
+    show_window(points, directions, read_wireframe(run.path("edges.json")), files)

@@ -32,7 +32,7 @@ def evaluate(run: "Run") -> dict[str, Any]:
     from taichi_edges.evaluation.metrics import evaluate as measure
     from taichi_edges.evaluation.metrics import exact_polylines, measure_alone
 
-    edges, _ = read_edges(run.path("edges.json"))
+    edges = read_edges(run.path("edges.json"))
     views, held_out = read_views(run.path("views.npz")), read_views(run.path("held_out.npz"))
     unit, truth = edges.transformed(views.similarity.to_unit), _ground_truth(run, views, held_out)
     if truth is None:

@@ -15,7 +15,7 @@ def export(run: "Run") -> dict[str, Any]:
     from taichi_edges.exporters import EXPORTERS
     from taichi_edges.exporters.overlays import contact_sheet, draw_overlays
 
-    wireframe, _ = read_wireframe(run.path("edges.json"))
+    wireframe = read_wireframe(run.path("edges.json"))
     views = with_whole_paths(run, read_views(run.path("views.npz")))
     written = []
     for suffix, write in EXPORTERS.items():

@@ -5,17 +5,20 @@ Precedence: defaults < preset < scale < scene file < `--preset` and `--scale` gi
 `--set key=value`.
 """
 
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from taichi_edges.errors import UserError, did_you_mean, refuse_unknown
-from taichi_edges.scene.paths import data_folder, expand, scene_path, shipped_scenes
+from taichi_edges.scene.paths import SHIPPED, data_folder, expand, scene_path, shipped_scenes
 from taichi_edges.scene.presets import PRESETS, SCALES, SCALES_OF_READERS
 from taichi_edges.scene.scene_file import check_scene, in_yaml, overlay, parse_yaml
 from taichi_edges.scene.settings import SceneConfig
 
 Setting = tuple[tuple[str, ...], Any, str]  # the names on the way to a key, its value, and where that was given
+BUNDLES = (("preset",), ("scale",))  # keys that stand for many
+EXAMPLE = SHIPPED / "demo.yaml"
 LISTING_SUFFIXES = (".json", ".npz", ".bin", ".txt")  # of files that list the views of a source
 
 
@@ -31,14 +34,15 @@ def load_scene(
 
     preset, scale: override the scene's, and the scene's own values where they name them.
     settings: 'key.subkey=value' strings, YAML values; or a dict of values and sections by key, such as
-    {"train.steps": 300, "fit": {"delta": 0.3}}. seed: overrides the scene's.
+    {"train.steps": 300, "fit": {"delta": 0.3}}; tuples, arrays, NumPy's numbers and paths are values, too.
+    seed: overrides the scene's.
     data_root: folder in which a relative source.path starts, None for that of TAICHI_EDGES_DATA; a scene that names no
     scale gets that of the layout found there. Returns the SceneConfig.
     """
     path = scene_path(path)
     content = _folder_content(path) if is_source(path) else _file_content(path)
-    refuse_unknown("--preset", preset, "preset", PRESETS)
-    refuse_unknown("--scale", scale, "scale", SCALES)
+    refuse_unknown("preset", preset, "preset", PRESETS)
+    refuse_unknown("scale", scale, "scale", SCALES)
     parsed = _parse_settings(settings)
     if scale is None and "scale" not in content:
         content |= _scale_of_source({**_section(content), **_settings_of_source(parsed)}, data_root)
@@ -49,8 +53,8 @@ def load_scene(
         origins[keys] = origin
         content = overlay(content, _nested(keys, value))
     if seed is not None:
-        content["seed"] = seed
-        origins[("seed",)] = f"--seed {seed}"
+        content["seed"] = _plain(seed)
+        origins[("seed",)] = f"seed {seed}"
     return check_scene(content, path, origins)
 
 
@@ -119,14 +123,14 @@ def _file_content(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
-        what = "a scene is a YAML file, see scenes/, or a folder of photographs"
+        what = f"a scene is a YAML file, as {EXAMPLE} is, or a folder of photographs"
         raise UserError(f"{path}: is not a text file; {what}") from error
     except OSError as error:
         raise UserError(f"{path}: {_why_unreadable(path, error)}") from error
     content = parse_yaml(text, path)
     if not isinstance(content, dict):
         what = "it is empty" if content is None else f"this is {in_yaml(content)}"
-        raise UserError(f"{path}: {what}, but a scene is a mapping of keys; see scenes/demo.yaml for an example")
+        raise UserError(f"{path}: {what}, but a scene is a mapping of keys; see {EXAMPLE} for an example")
     return {"name": path.stem, **content}
 
 
@@ -164,12 +168,34 @@ def _why_unreadable(path: Path, error: OSError) -> str:
 
 def _parse_settings(settings: Iterable[str] | Mapping[str, Any]) -> list[Setting]:
     """(('train', 'steps'), 300, 'train.steps=300') of each. settings: as `load_scene` takes."""
-    if not isinstance(settings, Mapping):
-        return [_parse_setting(setting) for setting in settings]
-    parsed = [(tuple(key.split(".")), value, f"{key}={value!r}") for key, value in settings.items()]
-    for keys, value, origin in parsed:
-        _refuse_bundle(keys, value, origin)
-    return parsed
+    if isinstance(settings, Mapping):
+        return [_named_setting(key, _plain(value)) for key, value in settings.items()]
+    listed = None if isinstance(settings, str) or not isinstance(settings, Iterable) else list(settings)
+    if listed is None or not all(isinstance(setting, str) for setting in listed):
+        raise UserError(f"settings: must be a dict, or a list of 'key=value', not {settings!r}")
+    return [_parse_setting(setting) for setting in listed]
+
+
+def _named_setting(key: Any, value: Any) -> Setting:
+    """'train.epochs', 100 -> (('train', 'epochs'), 100, 'train.epochs=100')."""
+    origin = f"{key}={value!r}"
+    keys = tuple(key.split(".")) if isinstance(key, str) else ()
+    if not keys or not all(keys):
+        raise UserError(f"{origin}: a key is a text, names with one dot between them, e.g. 'train.epochs'")
+    if keys in BUNDLES:
+        raise UserError(f"{origin}: a {key} brings many values with it; give it as the argument {key}")
+    return keys, value, origin
+
+
+def _plain(value: Any) -> Any:
+    """A value from Python as a scene file would give it: lists for tuples and arrays, texts for paths."""
+    if isinstance(value, Mapping):
+        return {key: _plain(below) for key, below in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return value.tolist() if hasattr(value, "tolist") else value  # NumPy, which is not imported for it
 
 
 def _parse_setting(setting: str) -> Setting:
@@ -178,12 +204,7 @@ def _parse_setting(setting: str) -> Setting:
     keys, origin = tuple(key.strip().split(".")), f"--set {setting}"
     if not equals or not all(keys):
         raise UserError(f"{origin}: write key=value, e.g. --set train.epochs=100")
-    _refuse_bundle(keys, value, origin)
-    return keys, parse_yaml(value, f"--set {key.strip()}"), origin
-
-
-def _refuse_bundle(keys: tuple[str, ...], value: Any, origin: str) -> None:
-    """UserError where a setting is a preset or a scale."""
-    if keys in (("preset",), ("scale",)):
+    if keys in BUNDLES:
         option = keys[0]
         raise UserError(f"{origin}: a {option} brings many values with it; use --{option}{value and ' '}{value}")
+    return keys, parse_yaml(value, f"--set {key.strip()}"), origin

@@ -14,6 +14,7 @@ not wait for it.
 import contextlib
 import errno
 import functools
+import numbers
 import os
 import platform
 import time
@@ -30,7 +31,7 @@ import taichi_edges
 from taichi_edges.corridor.findings import FINDINGS
 from taichi_edges.corridor.machine import available_threads, peak_memory_mib, reset_peak_memory
 from taichi_edges.corridor.stages import STAGES, Stage, function_of
-from taichi_edges.errors import UserError, refuse_unknown
+from taichi_edges.errors import OptionError, UserError, refuse_unknown
 from taichi_edges.files.artefacts import (
     digest,
     digest_file,
@@ -79,16 +80,20 @@ class Run:
         """Paths may be strings. data_root: None for that of TAICHI_EDGES_DATA, where it is set. threads: None for all
         that this process may use. progress: None for what the command shows; a plain Progress() is silent.
         """
+        if not isinstance(config, SceneConfig):
+            raise UserError(f"config: must be what load_scene returns, not {config!r}")
         threads = available_threads() if threads is None else threads
+        if not isinstance(threads, numbers.Integral) or isinstance(threads, bool):
+            raise OptionError(f"threads {threads!r}: must be a whole number")
         if not 1 <= threads <= MOST_THREADS:
             bound = "at least 1" if threads < 1 else f"at most {MOST_THREADS}"
-            raise UserError(f"--threads {threads}: must be {bound}")
-        refuse_unknown("--arch", arch, "device", ARCHS)
+            raise OptionError(f"threads {threads}: must be {bound}")
+        refuse_unknown("arch", arch, "device", ARCHS)
         vars(self).update(
             config=config,
-            folder=expand(folder, "--out"),
+            folder=expand(folder, "folder"),
             data_root=data_folder(data_root),
-            threads=threads,
+            threads=int(threads),
             arch=arch,
             progress=progress or make_progress(),
         )
@@ -135,13 +140,13 @@ def run_stages(run: Run, start: str | None = None, until: str | None = None) -> 
     lists the stages that were not skipped.
     """
     names = list(STAGES)
-    refuse_unknown("--stage", start, "stage", names)
-    refuse_unknown("--until", until, "stage", names)
+    refuse_unknown("start", start, "stage", names)
+    refuse_unknown("until", until, "stage", names)
     run = with_reader(run)
     first = names.index(start) if start else 0
     last = names.index(until) if until else len(names) - 1
     if first > last:
-        raise UserError(f"--stage {start} comes after --until {until}; the order is {' '.join(names)}")
+        raise UserError(f"{start} comes after {until}, so there is nothing to run; the order is {' '.join(names)}")
     for name in names[: last + 1]:
         STAGES[name].outside(run)  # a mistyped path must not come to light after the training
     with _own_folder(run):
@@ -225,7 +230,7 @@ def _inputs(run: Run, stage: Stage) -> dict[str, Any]:
 
 def _label(run: Run, path: Path) -> str:
     """A file's path, relative to the run's folder where it lies in it: a folder that was moved is not stale."""
-    return str(path.relative_to(run.folder)) if path.is_relative_to(run.folder) else str(path)
+    return (path.relative_to(run.folder) if path.is_relative_to(run.folder) else path).as_posix()
 
 
 def _why_stale(run: Run, record: dict[str, Any], name: str) -> tuple[str, str] | None:

@@ -117,13 +117,13 @@ def _task(run: "Run", detector: str) -> "DetectionTask":
 
 def _inside_the_run(run: "Run", views: Views) -> Views:
     """The views with paths relative to the run's folder for pictures in it: it may be moved."""
-    folder = str(run.folder)
-    paths = (os.path.relpath(path, folder) if path and _lies_in(path, folder) else path for path in views.image_paths)
-    return replace(views, image_paths=tuple(paths))
+    return replace(views, image_paths=tuple(_relative(path, str(run.folder)) for path in views.image_paths))
 
 
-def _lies_in(path: str, folder: str) -> bool:
-    return Path(os.path.abspath(path)).is_relative_to(os.path.abspath(folder))
+def _relative(path: str, folder: str) -> str:
+    """A path as it is seen from a folder that it lies in, with slashes; another as it is, '' for none as well."""
+    whole, around = Path(os.path.abspath(path)), Path(os.path.abspath(folder))
+    return whole.relative_to(around).as_posix() if path and whole.is_relative_to(around) else path
 
 
 def _refuse_needless_calibration(run: "Run", detector: str) -> None:

@@ -62,7 +62,7 @@ def reconstruct(
     run = open_run(scene, settings, **options, threads=threads, arch=arch, quiet=quiet)
     record = run_stages(run, start, until)
     done = stages_until(record, until)
-    wireframe = read_wireframe(run.path("edges.json"))[0] if "refine" in done else None
+    wireframe = read_wireframe(run.path("edges.json")) if "refine" in done else None
     metrics = read_facts(run.path("metrics.json")) if "evaluate" in done else None
     return Reconstruction(run, wireframe, metrics, record)
 
@@ -81,9 +81,9 @@ def open_run(
     quiet: bool,
 ) -> Run:
     """The Run of a scene, ready for `run_stages`. settings: as `load_scene` takes them, the rest as `reconstruct`."""
-    data = data_folder(data)
+    data, out = data_folder(data, "data"), expand(out, "out")
     config = load_scene(scene, preset, settings, seed, scale, data)
-    run = Run(config, expand(out, "--out") / config.name, data, threads, arch, make_progress(quiet))
+    run = Run(config, out / config.name, data, threads, arch, make_progress(quiet))
     run = with_reader(run)
     if is_source(scene_path(scene)):
         _refuse_results_of_another(run)

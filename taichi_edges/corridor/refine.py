@@ -4,7 +4,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from taichi_edges.errors import amount
-from taichi_edges.geometry.wireframe import read_wireframe, write_wireframe
+from taichi_edges.geometry.wireframe import wireframe_and_about, write_wireframe
 from taichi_edges.views.views import read_views
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ def refine(run: "Run") -> dict[str, Any]:
     from taichi_edges.refinement.stage import refine_wireframe
 
     views = read_views(run.path("views.npz"))
-    loose, about = read_wireframe(run.path("edges_fit.json"))
+    loose, about = wireframe_and_about(run.path("edges_fit.json"))
     loose = loose.transformed(views.similarity.to_unit, views.similarity.scale)
     if run.config.refine.enabled and len(loose) and not is_running(run.arch, run.threads):
         start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)

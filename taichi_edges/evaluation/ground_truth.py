@@ -21,6 +21,7 @@ import numpy as np
 
 from taichi_edges.errors import UserError, did_you_mean, name_some
 from taichi_edges.geometry.edge_set import EdgeSet, read_edges
+from taichi_edges.scene.paths import expand
 from taichi_edges.views.cameras import Similarity
 
 ABC_SPACING = 0.005  # raw CAD units (!), EMAP get_gt_points: the spacing in the unit cube differs from model to model
@@ -62,7 +63,7 @@ def read_ground_truth(path: Path | str, to_unit: Callable[[np.ndarray], np.ndarr
 
     to_unit: affine function (n, 3) -> (n, 3) from the scene's truth frame to its unit cube, for `.ply` and `.json`.
     """
-    path = Path(path)
+    path = expand(path, "truth")
     refuse_unknown(path)
     return read_abc(path) if path.is_dir() else FILE_READERS[path.suffix.lower()](path, to_unit)
 
@@ -247,7 +248,7 @@ def read_edge_file(path: Path, to_unit: Callable[[np.ndarray], np.ndarray] = as_
     """
     content = read_json(path, "edges")
     if isinstance(content, dict) and {"lines_end_pts", "curves_ctl_pts"} & content.keys():
-        edges = read_edges(path)[0]  # first, for a file of ours may have a key `edges` as well: their number
+        edges = read_edges(path)  # first, for a file of ours may have a key `edges` as well: their number
     elif isinstance(content, dict) and isinstance(content.get("edges"), list):
         edges = edges_of_list(path, content["edges"])
     else:

@@ -114,12 +114,13 @@ def true_wireframe(truth: "GroundTruth") -> EdgeGraph | None:
     return edge_graph(primitives, np.arange(len(primitives)))
 
 
-def refuse_unbounded(edges: "EdgeSet") -> None:
-    """UserError for an edge with a coordinate that is not finite: no distance to it exists."""
+def refuse_unbounded(edges: "EdgeSet", where: str = "") -> None:
+    """UserError for an edge with a coordinate that is not finite: no distance to it exists. where: 'edges.json: '."""
     finite = [np.isfinite(part).all(axis=(1, 2)) for part in (edges.lines, edges.curves)]
     for name, good in zip(("line", "curve"), finite, strict=True):
         if not good.all():
-            raise UserError(f"{name} {int(np.argmin(good))}: its points are not finite numbers; drop it before scoring")
+            number, problem = int(np.argmin(good)), "its points are not finite numbers"
+            raise UserError(f"{where}{name} {number}: {problem}; drop it before scoring")
 
 
 def piece_sources(edges: "EdgeSet") -> np.ndarray:

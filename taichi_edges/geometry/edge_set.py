@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from taichi_edges.errors import UserError
 from taichi_edges.files.artefacts import write_json
 from taichi_edges.geometry.bezier import bezier_lengths, evaluate_bezier
+from taichi_edges.scene.paths import expand
 
 
 @dataclass(frozen=True)
@@ -95,11 +96,14 @@ def write_edges(path: Path | str, edges: EdgeSet, about: dict[str, Any]) -> Path
     return write_json(path, content)
 
 
-def read_edges(path: Path | str) -> tuple[EdgeSet, dict[str, Any]]:
-    """Read an `edges.json` of ours or of EMAP's (which has no sources: there every piece is an edge of its own).
+def read_edges(path: Path | str) -> EdgeSet:
+    """The EdgeSet of an `edges.json`, of ours or of EMAP's (where every piece is an edge of its own)."""
+    return edges_and_about(path)[0]
 
-    Returns the EdgeSet and the dict of all the other keys.
-    """
+
+def edges_and_about(path: Path | str) -> tuple[EdgeSet, dict[str, Any]]:
+    """The EdgeSet of an `edges.json`, and the dict of its other keys."""
+    path = expand(path, "edges")
     try:
         with open(path, encoding="utf-8") as file:
             content = json.load(file)

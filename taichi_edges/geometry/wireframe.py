@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from taichi_edges.errors import UserError
-from taichi_edges.geometry.edge_set import EdgeSet, read_edges, write_edges
+from taichi_edges.geometry.edge_set import EdgeSet, edges_and_about, write_edges
 from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline
 
 
@@ -129,12 +129,17 @@ def write_wireframe(path: Path | str, wireframe: Wireframe, about: dict[str, Any
     return write_edges(path, wireframe.edge_set(), {**graph, **about})
 
 
-def read_wireframe(path: Path | str) -> tuple[Wireframe, dict[str, Any]]:
-    """The Wireframe of an `edges.json`, and the dict of its other keys.
+def read_wireframe(path: Path | str) -> Wireframe:
+    """The Wireframe of an `edges.json`.
 
     A file without the keys of the graph (EMAP's) gives loose edges, each source a line or a chain of cubics.
     """
-    edges, content = read_edges(path)
+    return wireframe_and_about(path)[0]
+
+
+def wireframe_and_about(path: Path | str) -> tuple[Wireframe, dict[str, Any]]:
+    """The Wireframe of an `edges.json`, as `read_wireframe` gives it, and the dict of its other keys."""
+    edges, content = edges_and_about(path)
     if "edges" not in content or not isinstance(content["edges"], list):
         return Wireframe.loose(_shapes_of_sources(edges)), content
     try:

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import taichi as ti
 
-from taichi_edges.errors import UserError
+from taichi_edges.errors import OptionError
 
+DEVICES = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
 STALE_LOCK = 60.0  # seconds; Taichi holds the lock of its kernel cache for some milliseconds
 
 
@@ -24,10 +25,9 @@ def start_taichi(arch: str, threads: int, seed: int, cache: Path | str) -> None:
     gc.collect()  # an ndarray of an earlier program that is freed later would take memory of the new one with it
     release_cache(Path(cache))
     cached = _is_writable(Path(cache))  # else Taichi would crash
-    available = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
     with contextlib.redirect_stdout(io.StringIO()):  # ti.init announces itself with a bare print
         ti.init(
-            arch=available[arch],
+            arch=DEVICES[arch],
             default_fp=ti.f32,
             cpu_max_num_threads=threads,
             random_seed=seed,
@@ -36,8 +36,8 @@ def start_taichi(arch: str, threads: int, seed: int, cache: Path | str) -> None:
             log_level=ti.ERROR,
         )
     in_use = ti.lang.impl.current_cfg().arch
-    if arch != "cpu" and in_use != available[arch]:
-        raise UserError(f"--arch {arch}: this machine offers Taichi no {arch} device; use --arch cpu")
+    if arch != "cpu" and in_use != DEVICES[arch]:
+        raise OptionError(f"arch {arch}: this machine offers Taichi no {arch} device; use cpu")
 
 
 def _is_writable(folder: Path) -> bool:

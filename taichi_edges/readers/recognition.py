@@ -148,7 +148,7 @@ def find_colmap(folder: Path) -> Found | None:
         return None
     project = _project_of(models[0])
     listing = models[0] if len(models) == 1 else models[0].parent
-    source = {"model": str(folder.resolve().relative_to(project))} if models == [folder] != [project] else {}
+    source = {"model": folder.resolve().relative_to(project).as_posix()} if models == [folder] != [project] else {}
     return Found("colmap", "a COLMAP project", project, listing, _count_views(project, models[0]), source)
 
 

@@ -113,13 +113,22 @@ _WORDS = {
 }
 
 
+# Keys that a scene does not have any more, or never had, and what to do instead.
+_NO_KEYS = {
+    "filter.grow_step": "it is gone, for growing goes by a pixel; leave it out",
+    "stage": "the stage to start with is --stage on the command line, the argument start from Python",
+    "show": "the window is opened by the command line alone, with --show",
+}
+
+
 def _describe(problem: "ErrorDetails", count: int, where: Path | str) -> str:
     """One line for pydantic's first finding."""
     location, context = problem["loc"], problem.get("ctx", {})
     key = ".".join(str(part) for part in location)
     more = f" (and {count - 1} more mistake{'s' if count > 2 else ''})" if count > 1 else ""
     if problem["type"] == "extra_forbidden":
-        return f"{where}: {key}: unknown key{_nearest_key(location)}{more}"
+        hint = f"; {_NO_KEYS[key]}" if key in _NO_KEYS else _nearest_key(location)
+        return f"{where}: {key}: unknown key{hint}{more}"
     message = _WORDS.get(problem["type"], problem["msg"].removeprefix("Value error, ")).format(**context)
     value = problem.get("input")
     simple = isinstance(value, (str, int, float, type(None))) and problem["type"] != "invalid_key"
