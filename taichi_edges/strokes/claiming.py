@@ -15,10 +15,9 @@ import numpy as np
 
 from taichi_edges.fitting.arc_batch import ArcBatch
 from taichi_edges.fitting.arcs import Arc, fit_arc
-from taichi_edges.fitting.prices import price_of_arc
+from taichi_edges.fitting.prices import OUTLIER, price_of_arc
 from taichi_edges.strokes.arc_growth import INLIER, Cloud, Inliers, grown_from_seeds, unbroken
 
-OUTLIER = INLIER**2  # squared noises: what a point on an edge brings at most
 OWN_SHARE = 0.5  # of the points along a stretch, which must be an arc's own: elsewhere it repeats another
 LEAST_DENSITY = 4.0  # own points on the length of a gap, on average; strays line up by chance, but not so closely
 ROUNDS, COARSER = 3, 2.0  # of claiming, and from the noise of one to that of the next

@@ -14,9 +14,9 @@ import numpy as np
 
 from taichi_edges.fitting.arcs import Arc, fit_arc
 from taichi_edges.fitting.cubic_chains import Ordering, fit_chain, nearest_on_chain
-from taichi_edges.fitting.prices import CUBIC_PRICE, MOST_CUBICS, NEXT_CUBIC_PRICE, price_of_arc
+from taichi_edges.fitting.prices import MOST_CUBICS, OUTLIER, price_of_arc, price_of_cubics
 from taichi_edges.strokes.arc_growth import INLIER, SAGITTA, Cloud, sagitta
-from taichi_edges.strokes.claiming import OUTLIER, Claim
+from taichi_edges.strokes.claiming import Claim
 
 WIDE = 4.0  # times the tolerance: the first fit to two pieces starts from one of them, and looks farther
 
@@ -222,7 +222,7 @@ def free_piece(cloud: Cloud, end: End, other: End, own: np.ndarray, shared: np.n
             break
         curves, _ = fit_chain(points, ordering, INLIER * noises.max(), cubics)
         distances, along = nearest_on_chain(points, curves)
-        cost = (CUBIC_PRICE + NEXT_CUBIC_PRICE * (cubics - 1)) * np.log(len(points)) + capped(distances**2, noises)
+        cost = price_of_cubics(cubics) * np.log(len(points)) + capped(distances**2, noises)
         if best is None or cost < best.cost:
             best = Piece(None, curves, own, shared, along, cost)
     return best
