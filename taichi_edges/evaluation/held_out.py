@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taichi_edges.evaluation.edgel_index import MOST_SINE, EdgelIndex
+from taichi_edges.evaluation.edgel_index import EdgelIndex
 from taichi_edges.evaluation.projected_curves import Chords, Traces
+from taichi_edges.views.edgels import MOST_SINE
 from taichi_edges.views.splitting import LEAST_LEFT
 from taichi_edges.views.views import Views, pixel_size
 

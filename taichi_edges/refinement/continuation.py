@@ -37,7 +37,7 @@ LEAST_GAP_VIEWS = 1.0  # and by one at least
 REPEATED = 0.9  # of the places of a stroke beside others, from which on it says nothing new
 
 Seen = Callable[[Shape, np.ndarray], np.ndarray]  # (n,) how many views see a shape at (n,) parameters
-End = tuple[int, int]  # number of the shape, side 0 or 1
+ShapeEnd = tuple[int, int]  # number of the shape, side 0 or 1
 
 
 @dataclass(frozen=True)
@@ -229,7 +229,7 @@ def smooth_paths(
         if number in seen:
             continue
         path, start = [], (number, side)
-        onward: End | None = start
+        onward: ShapeEnd | None = start
         while onward is not None and onward[0] not in seen:
             number, side = onward
             seen.add(number)
@@ -239,7 +239,7 @@ def smooth_paths(
     return paths
 
 
-def stroke_joints(shapes: Sequence[Shape], yardstick: Yardstick, gap_px: float) -> dict[End, End]:
+def stroke_joints(shapes: Sequence[Shape], yardstick: Yardstick, gap_px: float) -> dict[ShapeEnd, ShapeEnd]:
     """{(shape, side): (shape, side)} of ends that continue each other, each the best for the other."""
     ends = [(number, side) for number, shape in enumerate(shapes) if not shape.closed for side in (0, 1)]
     if len(ends) < 2:
@@ -258,7 +258,7 @@ def stroke_joints(shapes: Sequence[Shape], yardstick: Yardstick, gap_px: float) 
             turn = np.arccos(np.clip(-outward[i] @ outward[j], -1, 1))
             ahead = abs(step @ along) / (4 * yardstick.pixel)
             found.append((aside / yardstick.noise + turn / np.radians(5.0) + ahead, i, j))
-    partner: dict[End, End] = {}
+    partner: dict[ShapeEnd, ShapeEnd] = {}
     for _, i, j in sorted(found):
         if ends[i] not in partner and ends[j] not in partner:
             partner[ends[i]], partner[ends[j]] = ends[j], ends[i]

@@ -80,7 +80,7 @@ class Piece:
 
 
 @dataclass(frozen=True)
-class End:
+class PieceEnd:
     """One end of a Piece, side 0 or 1."""
 
     piece: Piece
@@ -106,7 +106,7 @@ def merged(cloud: Cloud, claims: Sequence[Claim], noises: np.ndarray) -> list[Pi
         for number in some:
             ends.add(number, pieces[number])
         for a, b in piece_joints(cloud, pieces, ends, some):
-            gain, piece = joined(cloud, End(pieces[a[0]], a[1]), End(pieces[b[0]], b[1]))
+            gain, piece = joined(cloud, PieceEnd(pieces[a[0]], a[1]), PieceEnd(pieces[b[0]], b[1]))
             if piece is not None:
                 heapq.heappush(waiting, (-gain, a[0], b[0], next(turns), piece))
 
@@ -178,7 +178,7 @@ def piece_joints(
     return sorted(found)
 
 
-def joined(cloud: Cloud, end: End, other: End) -> tuple[float, Piece | None]:
+def joined(cloud: Cloud, end: PieceEnd, other: PieceEnd) -> tuple[float, Piece | None]:
     """What it gains to make the pieces of two Ends one, and that Piece; 0 and None where it does not pay."""
     a, b = end.piece, other.piece
     own = np.union1d(a.own, b.own)
@@ -211,7 +211,7 @@ def arc_piece(cloud: Cloud, start: Arc, own: np.ndarray, shared: np.ndarray, str
     return piece_of(cloud, arc.recentred(), own, shared)
 
 
-def free_piece(cloud: Cloud, end: End, other: End, own: np.ndarray, shared: np.ndarray) -> Piece | None:
+def free_piece(cloud: Cloud, end: PieceEnd, other: PieceEnd, own: np.ndarray, shared: np.ndarray) -> Piece | None:
     """The points of two pieces as a smooth chain of as few cubics as pay; see `joined`."""
     members = np.concatenate([own, shared])
     points, noises = cloud.points[members], cloud.noises[members]
@@ -228,8 +228,8 @@ def free_piece(cloud: Cloud, end: End, other: End, own: np.ndarray, shared: np.n
     return best
 
 
-def chained(end: End, other: End, members: np.ndarray) -> Ordering:
-    """Ordering of the members of two pieces: along the one to its End, on from the other End along the other."""
+def chained(end: PieceEnd, other: PieceEnd, members: np.ndarray) -> Ordering:
+    """Ordering of the members of two pieces: along the one to its end, on from the end of the other along that."""
     (places, outwards), (other_places, _) = end.piece.ends(), other.piece.ends()
     gap = (other_places[other.side] - places[end.side]) @ outwards[end.side]
     order = np.argsort(members, kind="stable")
