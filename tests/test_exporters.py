@@ -28,9 +28,9 @@ from taichi_edges.exporters.overlays import (
     draw_overlays,
     frustum_planes,
 )
-from taichi_edges.exporters.palette import CLUSTER_COLOURS, CURVE_COLOUR, LINE_COLOUR, UNLABELLED_COLOUR, label_colours
-from taichi_edges.exporters.point_cloud import read_oriented_points, write_oriented_points
 from taichi_edges.exporters.viewer import build_geometries, show
+from taichi_edges.files.palette import CLUSTER_COLOURS, CURVE_COLOUR, LINE_COLOUR, UNLABELLED_COLOUR, label_colours
+from taichi_edges.files.point_cloud import read_oriented_points, write_oriented_points
 from taichi_edges.files.splats import FIELDS, HARMONIC_0, read_gaussians, write_gaussians
 from taichi_edges.geometry.shapes import EllipticArc, Line, Spline, polyline
 from taichi_edges.geometry.wireframe import Edge, Evidence, Wireframe
@@ -545,7 +545,7 @@ def test_viewer_geometries_hold_points_directions_and_edges(edges, rng):
 def test_exporters_are_imported_without_open3d():
     """A run on a cluster that never exports must not pay for, or fail on, a graphics library."""
     code = (
-        "import sys; from taichi_edges.exporters import line_sets, overlays, point_cloud, viewer; "
-        "from taichi_edges.files import splats; sys.exit('open3d' in sys.modules)"
+        "import sys; from taichi_edges.exporters import line_sets, overlays, viewer; "
+        "from taichi_edges.files import point_cloud, splats; sys.exit('open3d' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

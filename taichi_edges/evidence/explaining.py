@@ -34,14 +34,14 @@ class Explained(Columns):
     """What edgels say about points when each of them counts for one edge alone.
 
     support: (n,) share of the views that have a point in the image in which it lies on an edgel of its own edge.
-    steadiness: (n,) of the edgels near a point's projections that no other edge explains, the share that lies on them;
-    relative to that of the best-supported points, which is below 1 as much as the edgels are noisy.
+    relative_steadiness: (n,) of the edgels near a point's projections that no other edge explains, the share that lies
+    on them, over that of the best-supported points, which is below 1 as much as the edgels are noisy.
     spread: (n,) that of the RefinedPoints: from how different directions they are seen.
     noise_px: standard deviation across the edge of the edgels of the best-supported points.
     """
 
     support: np.ndarray
-    steadiness: np.ndarray
+    relative_steadiness: np.ndarray
     spread: np.ndarray
     noise_px: float
 

@@ -11,8 +11,8 @@ import numpy as np
 from taichi_edges.errors import UserError
 from taichi_edges.exporters.line_sets import line_set_arrays
 from taichi_edges.exporters.naming import confidence_of
-from taichi_edges.exporters.palette import CURVE_COLOUR, LINE_COLOUR
 from taichi_edges.files.artefacts import replacing
+from taichi_edges.files.palette import CURVE_COLOUR, LINE_COLOUR
 from taichi_edges.views.cameras import NEAR
 from taichi_edges.views.pictures import SAME_SHAPE, read_colour
 from taichi_edges.views.views import Views, choose_views

@@ -170,7 +170,7 @@ def judge(matching: "EdgelMatching", refined: "RefinedPoints", config: "FilterCo
     steady, places = supported.copy(), refined.points[supported]
     if len(places):
         around = cKDTree(places).query(places, min(AROUND, len(places)))[1].reshape(len(places), -1)
-        typical = np.median(explained.steadiness[supported][around], axis=1)
+        typical = np.median(explained.relative_steadiness[supported][around], axis=1)
         steady[supported] = typical >= config.min_steadiness
     return Judgement(supported, steady, explained)
 

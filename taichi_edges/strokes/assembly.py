@@ -98,7 +98,7 @@ def sharers(shared: np.ndarray, count: int) -> list[np.ndarray]:
 
 
 def fit_edge(points: np.ndarray, arc: Arc | None, config: "FitConfig") -> ClusterFit:
-    """The Fit of one edge: its line or arc as it is, if the paper's ratio of errors keeps the arc, or `fit_cluster`."""
+    """The ClusterFit of one edge: its line or arc as it is, if the paper's ratio keeps that, or `fit_cluster`."""
     if arc is None:
         return fit_cluster(points, config)
     if arc.length < config.min_length:
