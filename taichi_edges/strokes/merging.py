@@ -105,7 +105,7 @@ def merged(cloud: Cloud, claims: Sequence[Claim], noises: np.ndarray) -> list[Pi
     def propose(some: Sequence[int]) -> None:
         for number in some:
             ends.add(number, pieces[number])
-        for a, b in piece_joints(cloud, pieces, ends, some):
+        for a, b in facing_ends(cloud, pieces, ends, some):
             gain, piece = joined(cloud, PieceEnd(pieces[a[0]], a[1]), PieceEnd(pieces[b[0]], b[1]))
             if piece is not None:
                 heapq.heappush(waiting, (-gain, a[0], b[0], next(turns), piece))
@@ -162,7 +162,7 @@ class EndGrid:
         return tuple(np.floor(place / self.reach).astype(int).tolist())
 
 
-def piece_joints(
+def facing_ends(
     cloud: Cloud, pieces: Mapping[int, Piece], grid: EndGrid, some: Iterable[int]
 ) -> list[tuple[NumberedEnd, NumberedEnd]]:
     """Pairs of ends that are near and look at each other, each (number of the piece, 0 or 1); one of them in `some`.
