@@ -77,4 +77,4 @@ def scatter_gaussians(scene, count, generator):
     chosen = generator.choice(len(starts), count, p=lengths / lengths.sum())
     points = starts[chosen] + generator.random((count, 1)) * (ends - starts)[chosen]
     noise = NOISE_PX * pixel_size(scene.intrinsics, scene.world_to_camera)
-    return start_gaussians(points + generator.normal(0.0, noise, points.shape), generator)
+    return start_gaussians(points + generator.normal(0.0, noise, points.shape), generator, 0.004, 0.08)

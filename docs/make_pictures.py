@@ -22,7 +22,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from taichi_edges.exporters.overlays import background, draw_edges
-from taichi_edges.exporters.palette import label_colours
+from taichi_edges.files.palette import label_colours
 from taichi_edges.geometry.wireframe import read_wireframe
 from taichi_edges.strokes.clusters import read_clusters
 from taichi_edges.views.views import read_views

@@ -6,7 +6,7 @@ import pytest
 from taichi_edges.strokes import segmentation
 from taichi_edges.strokes.branches import separate_branches
 from taichi_edges.strokes.segmentation import (
-    CURVE_PRICE,
+    ARC_PRICE,
     LINE_PRICE,
     MIN_NOISE,
     MIN_STRETCH,
@@ -137,7 +137,7 @@ def slow_cuts(chain):
         for (cost, bounds, kinds), start in zip(best, stations, strict=True):
             line, curve = slow_costs(chain[start:end], noise)
             ways.append((cost + line + LINE_PRICE * price, [*bounds, end], [*kinds, False]))
-            ways.append((cost + curve + CURVE_PRICE * price, [*bounds, end], [*kinds, True]))
+            ways.append((cost + curve + ARC_PRICE * price, [*bounds, end], [*kinds, True]))
         best.append(min(ways, key=lambda way: way[0]))
     return best[-1][1:]
 

@@ -13,8 +13,8 @@ from scipy.interpolate import BSpline
 
 from taichi_edges.exporters.dxf import APPLICATION, layer_of, write_dxf
 from taichi_edges.exporters.nurbs import joined
-from taichi_edges.exporters.palette import KIND_COLOURS
 from taichi_edges.exporters.step import connected_parts, encoded, prefix_for, write_step
+from taichi_edges.files.palette import KIND_COLOURS
 from taichi_edges.geometry.bezier import evaluate_bezier
 from taichi_edges.geometry.edge_set import write_edges
 from taichi_edges.geometry.shapes import EllipticArc, Line, Spline

@@ -12,8 +12,8 @@ from taichi_edges.geometry.shapes import EllipticArc, Line, Spline, polyline
 from taichi_edges.refinement.continuation import (
     Merging,
     continued,
+    partners_of_ends,
     smooth_paths,
-    stroke_joints,
     with_whole_circles,
     without_repeats,
 )
@@ -179,7 +179,7 @@ def test_each_end_is_continued_once(generator, seed):
 
 def test_ends_continue_each_other_both_ways(generator):
     strokes, _ = strokes_of([part(WHOLE["arc"], a, a + 0.24) for a in (0, 0.25, 0.5, 0.75)], generator)
-    partner = stroke_joints(strokes, YARDSTICK, 12.0)
+    partner = partners_of_ends(strokes, YARDSTICK, 12.0)
     assert len(partner) == 6 and all(partner[other] == end for end, other in partner.items())
     assert all(end[0] != other[0] for end, other in partner.items())
 

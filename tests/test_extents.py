@@ -6,10 +6,16 @@ from placed_shapes import PLANE, Placing, any_shape
 
 from taichi_edges.fitting.distances import distances_to
 from taichi_edges.geometry.shapes import EllipticArc, Line
-from taichi_edges.refinement.extents import AHEAD_PX, LOST_PX, ROUNDS, extended
+from taichi_edges.refinement import extents
+from taichi_edges.refinement.extents import AHEAD_PX, LOST_PX, ROUNDS
 
 PIXEL = 0.0025  # unit-cube units
 SEEDS = range(3)
+
+
+def extended(shape, sides, seen, pixel):
+    """One shape alone."""
+    return extents.extended([shape], [sides], lambda numbers, places: [seen(*places[0])], pixel)[0]
 
 
 def views_of(*shown, views=10.0):

@@ -189,14 +189,14 @@ def test_what_is_hidden_is_hardly_ever_judged(bracket):
     """Against ray casting. Where visibility ends between two views, nothing can be said: those are the exceptions."""
     part, training, held_out = bracket
     places, tangents, _ = Chords.of(exact_polylines(part.edges)).places(PLACE_PX * pixel_size(training))
-    sightings, scene = Visibility.of(places, tangents, training), ray_scene(part)
+    visibility, scene = Visibility.of(places, tangents, training), ray_scene(part)
     zeros = np.zeros(len(places), int)
     samples = LineSamples(places, outward_directions(part, places, 0.001), zeros, zeros)
     visible, judged = [], []
     for view in range(len(held_out)):
         centre = held_out.camera(view).centre
         visible.append(visible_from(scene, samples, centre))
-        judged.append(sightings.judged_from(centre))
+        judged.append(visibility.judged_from(centre))
     visible, judged = np.concatenate(visible), np.concatenate(judged)
     assert 0.2 < visible.mean() < 0.9  # the test would say nothing otherwise
     assert judged[~visible].mean() < 0.15

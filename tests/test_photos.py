@@ -108,7 +108,7 @@ def similar(points, targets):
 
 
 def test_the_same_photographs_are_not_solved_again(album, solved, monkeypatch):
-    monkeypatch.setattr(photos, "reconstruct", None)  # whoever calls it, fails
+    monkeypatch.setattr(photos, "solve_poses", None)  # whoever calls it, fails
     again, _ = posed(album[0], solved[2])
     assert (np.stack(again.camera_to_world) == np.stack(solved[0].camera_to_world)).all()
     with pytest.raises(TypeError):
@@ -218,7 +218,7 @@ def test_every_pair_of_few_photographs_is_matched_and_of_many_a_number_that_grow
 
 def test_a_damaged_record_is_no_obstacle(album, solved, tmp_path, monkeypatch):
     calls = []
-    monkeypatch.setattr(photos, "reconstruct", lambda *arguments: calls.append(arguments) or [])
+    monkeypatch.setattr(photos, "solve_poses", lambda *arguments: calls.append(arguments) or [])
     (tmp_path / "photographs.json").write_text("{")
     with pytest.raises(UserError, match="only 0 of 7"):
         posed(album[0], tmp_path)
@@ -235,7 +235,7 @@ def test_files_that_are_no_images_are_left_out_by_name(album, tmp_path, monkeypa
     (tmp_path / "notes.tif").write_text("no picture")
     (tmp_path / "text.jpg").write_bytes(b"no picture\xff\xd9")
     given = []
-    monkeypatch.setattr(photos, "reconstruct", lambda images, names, groups, *rest: given.extend(names) or [])
+    monkeypatch.setattr(photos, "solve_poses", lambda images, names, groups, *rest: given.extend(names) or [])
     for _ in range(2):  # the second time as it is recorded
         told, config = Told(), config_of(tmp_path)
         with pytest.raises(UserError, match="only 0 of 6"):
@@ -257,7 +257,7 @@ def test_a_damaged_model_of_an_earlier_run_is_made_anew(album, solved, tmp_path,
         shutil.copy(whole, path)
         return json.loads((cache / "photographs.json").read_text())["registered"]
 
-    monkeypatch.setattr(photos, "reconstruct", remade)
+    monkeypatch.setattr(photos, "solve_poses", remade)
     frames, told = posed(album[0], tmp_path / "cache")
     assert frames.names == solved[0].names and any("structure from motion from 7" in text for text in told.notes)
 

@@ -29,9 +29,9 @@ from taichi_edges.corridor.findings import FINDINGS
 from taichi_edges.corridor.loading import load_scene
 from taichi_edges.corridor.pipeline import STAGES, Run, run_stages
 from taichi_edges.errors import UserError
-from taichi_edges.exporters.point_cloud import read_oriented_points
 from taichi_edges.files import artefacts
 from taichi_edges.files.artefacts import digest_file, remove_unfinished, replacing
+from taichi_edges.files.point_cloud import read_oriented_points
 from taichi_edges.files.splats import read_gaussians
 from taichi_edges.geometry.edge_set import EdgeSet, edges_and_about, read_edges, write_edges
 from taichi_edges.geometry.wireframe import read_wireframe

@@ -416,7 +416,7 @@ def test_gaussians_grow_beyond_the_capacity_without_a_change(open_splatter, seed
 
 def test_start_gaussians_are_the_supplements(generator):
     points = generator.random((50, 3))
-    gaussians = start_gaussians(points, generator)
+    gaussians = start_gaussians(points, generator, 0.004, 0.08)
     np.testing.assert_array_equal(gaussians.means, points.astype(np.float32))
     np.testing.assert_allclose(gaussians.scales, 0.004, rtol=1e-6)
     np.testing.assert_allclose(gaussians.opacities, 0.08, rtol=1e-6)

@@ -9,7 +9,7 @@ import reference_support as reference
 
 from taichi_edges.evidence import pixel_owners, support
 from taichi_edges.evidence.pixel_owners import PixelOwners
-from taichi_edges.evidence.support import edge_strength, exclusive_support, line_width
+from taichi_edges.evidence.support import exclusive_support, line_width
 from taichi_edges.synthetic.rendering import ring_cameras
 from taichi_edges.views.drawing import draw_lines
 from taichi_edges.views.views import Views
@@ -51,7 +51,7 @@ def test_points_on_an_edge_are_supported_and_strays_are_not(taichi):
     support = exclusive_support(views, np.concatenate([on_edges, strays]), 0.5)
     assert support[: len(on_edges)].min() > 0.5
     assert np.quantile(support[len(on_edges) :], 0.99) < 0.1
-    assert edge_strength(views, on_edges).mean() > 0.8
+    assert PixelOwners(views, on_edges.astype(np.float32), 0.5).strength.mean() > 0.8
 
 
 def test_a_stray_point_shares_no_support_with_the_edge_it_projects_onto(taichi):
@@ -68,7 +68,7 @@ def test_a_stray_point_shares_no_support_with_the_edge_it_projects_onto(taichi):
 def test_points_no_view_sees_have_neither_strength_nor_support(taichi):
     views = scene(A)
     far = np.array([[0.5, 0.5, 50.0], [100.0, 0.0, 0.0], [np.nan, 0.5, 0.5], [0.5, np.inf, 0.5], [1e300, 0.5, 0.5]])
-    assert edge_strength(views, far).tolist() == [0.0] * 5
+    assert PixelOwners(views, far[:2].astype(np.float32), 0.5).strength.tolist() == [0.0] * 2
     assert exclusive_support(views, far, 0.5).tolist() == [0.0] * 5
     on_edge = np.linspace(*A, 20)
     together = exclusive_support(views, np.concatenate([far, on_edge]), 0.5)
@@ -77,7 +77,7 @@ def test_points_no_view_sees_have_neither_strength_nor_support(taichi):
 
 def test_no_points_are_no_error(taichi):
     views = scene(A)
-    assert edge_strength(views, np.zeros((0, 3))).shape == exclusive_support(views, np.zeros((0, 3)), 0.5).shape == (0,)
+    assert exclusive_support(views, np.zeros((0, 3)), 0.5).shape == (0,)
 
 
 def test_a_map_without_background_does_not_count_for_the_width_of_the_lines():
@@ -137,7 +137,6 @@ def test_strength_is_that_of_the_slow_twin(taichi, generator):
     assert {0, 1, len(views)} <= set(seen.tolist())
     # A coordinate is off by some 1e-5 px in float32, and neighbouring pixels differ by up to 1.
     np.testing.assert_allclose(shown.strength, expected, atol=1e-4)
-    np.testing.assert_allclose(edge_strength(views, points), expected, atol=1e-4)
 
 
 @pytest.mark.parametrize("claim_px", [0.7, 1.6, 3.3])

@@ -205,8 +205,8 @@ def test_a_contour_is_not_steady_and_an_edge_is(taichi, generator, errors):
     refined = refine_points(matching, np.concatenate([edge, limbs]), np.concatenate([along, upright]))
     explained = explain(matching, refined)
     assert explained.noise_px == pytest.approx(0.05, abs=0.03)
-    assert np.median(explained.steadiness[:200]) > 0.9
-    assert np.median(explained.steadiness[200:]) < 0.6
+    assert np.median(explained.relative_steadiness[:200]) > 0.9
+    assert np.median(explained.relative_steadiness[200:]) < 0.6
     judged = judge(matching, refined, FilterConfig(refine=True))
     assert judged.supported[:200].all() and judged.steady[:200].mean() > 0.95
     assert judged.steady[200:].mean() < 0.3
@@ -266,7 +266,7 @@ def test_filter_refines_keeps_edges_and_drops_strays(taichi, generator, errors):
     found, counts = filter_points(means, directions, opacities, views, config, 0.5, generator)
     off = np.min([distances_to(curve, found.points) for curve in curves], axis=0)
     assert np.median(off) < 0.1 * pixel_of(views) and (off < pixel_of(views)).mean() > 0.99
-    assert len(found.points) == len(found.directions) == len(found.explained.steadiness) > 0.9 * (900 - 50)
+    assert len(found.points) == len(found.directions) == len(found.explained.relative_steadiness) > 0.9 * (900 - 50)
     assert counts.gaussians == len(means) and counts.low_opacity == 50
     assert len(found) == counts.gaussians - counts.low_opacity - counts.low_support - counts.unsteady
 

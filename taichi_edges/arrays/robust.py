@@ -1,8 +1,13 @@
-"""The robust weight of Geman and McClure: the larger a residual, the less it counts, and outliers hardly at all."""
+"""Statistics that outliers do not spoil.
+
+The robust weight is that of Geman and McClure: the larger a residual, the less it counts, and outliers hardly at all.
+"""
 
 from typing import TypeVar
 
 import numpy as np
+
+NORMAL_MAD = 1.4826  # standard deviations for each median absolute deviation, of a normal distribution
 
 Numbers = TypeVar("Numbers", float, np.ndarray)
 

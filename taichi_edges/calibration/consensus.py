@@ -6,11 +6,11 @@ from typing import TypeVar
 
 import numpy as np
 
+from taichi_edges.arrays.robust import NORMAL_MAD
 from taichi_edges.calibration.backgrounds import CLEAR, Sides
 from taichi_edges.calibration.offsets import (
     LEAST_OBSERVATIONS,
     MOST_RESIDUAL,
-    NORMAL_MAD,
     Estimate,
     Observations,
     OffsetFit,

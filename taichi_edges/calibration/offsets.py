@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from taichi_edges.arrays.columns import Columns
-from taichi_edges.arrays.robust import geman_mcclure
+from taichi_edges.arrays.robust import NORMAL_MAD, geman_mcclure
 
 LEAST_OBSERVATIONS = 200  # fewer tell nothing
 # px, median; where references agree with edgels no better, as on textured photographs or between thin bars, chance has
@@ -19,7 +19,6 @@ CUT = 2.0  # standard deviations of the residuals at which the Geman-McClure wei
 # A point that is mostly on silhouettes would explain their offset, which is not quite the same all round, by moving;
 # interior edgels, which have none, shall say where it is.
 INTERIOR_WEIGHT = 3.0
-NORMAL_MAD = 1.4826  # standard deviations for each median absolute deviation, of a normal distribution
 MOST_STIFF = 3.0  # a fit with more has hardly an optimum
 VIEW_BLOCKS, SPLITS = 10, 4  # views next to each other, and halves of halves of the points, that are left out together
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def cluster(run: "Run") -> dict[str, Any]:
     """`gaussians.ply`, `views.npz` -> `points.ply` (filtered oriented points, input frame) and `clusters.npz`."""
-    from taichi_edges.exporters.point_cloud import write_oriented_points
+    from taichi_edges.files.point_cloud import write_oriented_points
     from taichi_edges.files.splats import read_gaussians
     from taichi_edges.kernels.device import is_running, start_taichi
     from taichi_edges.points.filtering import FEW_VIEWS, filter_points

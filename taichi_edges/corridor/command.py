@@ -84,8 +84,8 @@ def _print_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[st
 
 def show(run: Run) -> None:
     """An Open3D window of the oriented points and the edges."""
-    from taichi_edges.exporters.point_cloud import read_oriented_points
     from taichi_edges.exporters.viewer import show as show_window
+    from taichi_edges.files.point_cloud import read_oriented_points
     from taichi_edges.geometry.wireframe import read_wireframe
 
     for artefact in ("points.ply", "edges.json"):

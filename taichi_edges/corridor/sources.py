@@ -72,13 +72,13 @@ def picture_files(run: "Run") -> list[Path]:
 
 def truth_files(run: "Run") -> list[Path]:
     """Every file the ground truth consists of."""
-    from taichi_edges.evaluation.ground_truth import refuse_unknown
+    from taichi_edges.evaluation.ground_truth import check_truth_path
 
     path = truth_path(run)
     if path is None:
         return []
     if run.config.evaluation.truth:  # that of a synthetic scene may still have to be written
-        refuse_unknown(path)
+        check_truth_path(path)
     truth = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
     return truth + _scan_map_files(run)
 

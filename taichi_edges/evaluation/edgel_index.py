@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from taichi_edges.arrays.components import components
+from taichi_edges.views.edgels import MOST_SINE
 
-MOST_SINE = 0.35  # of the angle between a direction and an edgel's: 20 degrees, as a bend or noise may turn it
 LINK_PX = 2.0  # edgels that follow each other are about a pixel apart; one may be missing
 LINK_BESIDE_PX = 0.7  # across both of two edgels that follow each other: half the diagonal of a pixel
 LONG_PX = 30.0  # extent of a chain from which on it is a long edge; few strokes of a texture run so far

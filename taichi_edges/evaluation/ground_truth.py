@@ -64,11 +64,11 @@ def read_ground_truth(path: Path | str, to_unit: Callable[[np.ndarray], np.ndarr
     to_unit: affine function (n, 3) -> (n, 3) from the scene's truth frame to its unit cube, for `.ply` and `.json`.
     """
     path = expand(path, "truth")
-    refuse_unknown(path)
+    check_truth_path(path)
     return read_abc(path) if path.is_dir() else FILE_READERS[path.suffix.lower()](path, to_unit)
 
 
-def refuse_unknown(path: Path) -> None:
+def check_truth_path(path: Path) -> None:
     """UserError for what cannot be a ground truth, by names alone: quick enough to ask before the training."""
     if path.is_dir():
         if only_file(path, "*_features_*.yml") is None:
@@ -91,7 +91,7 @@ def polyline_length(polyline: np.ndarray) -> float:
 def read_abc(folder: Path) -> GroundTruth:
     """The sharp curves of an ABC folder, sampled as EMAP samples them."""
     features = only_file(folder, "*_features_*.yml")
-    assert features is not None, "see refuse_unknown"
+    assert features is not None, "see check_truth_path"
     sharp = read_sharp_curves(features)
     frame = read_frame(folder / "stats.json", scene=features.name.split("_")[0])
     mesh = only_file(folder, "*_trimesh_*.obj")

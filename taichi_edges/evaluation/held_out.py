@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taichi_edges.evaluation.edgel_index import MOST_SINE, EdgelIndex
+from taichi_edges.evaluation.edgel_index import EdgelIndex
 from taichi_edges.evaluation.projected_curves import Chords, Traces
+from taichi_edges.views.edgels import MOST_SINE
 from taichi_edges.views.splitting import LEAST_LEFT
 from taichi_edges.views.views import Views, pixel_size
 
@@ -125,19 +126,19 @@ def held_out_metrics(polylines: Sequence[np.ndarray], training: Views, held_out:
     if len(held_out):
         spacing = max(PLACE_PX * pixel_size(training), chords.travelled[-1] / MOST_PLACES)
         places, tangents, ends = chords.places(spacing)
-        sightings = Visibility.of(places, tangents, training)
-        scores = [score_view(chords, ends, sightings, held_out, view) for view in range(len(held_out))]
+        visibility = Visibility.of(places, tangents, training)
+        scores = [score_view(chords, ends, visibility, held_out, view) for view in range(len(held_out))]
     return {"held_out_views": len(held_out), **metrics_of(scores)}
 
 
-def score_view(chords: Chords, ends: np.ndarray, sightings: Visibility, views: Views, view: int) -> Score:
+def score_view(chords: Chords, ends: np.ndarray, visibility: Visibility, views: Views, view: int) -> Score:
     """Score of Chords in one of some Views. ends: (n,) where on the Chords the stretch of each place ends."""
     assert views.edgels is not None
     camera, (points, normals, strengths) = views.camera(view), views.edgels.of_view(view)
     index = EdgelIndex.of(points, normals, views.width, views.height)
     traces = chords.in_image(camera, SPACING_PX)
     place = np.minimum(np.searchsorted(ends, traces.travelled), len(ends) - 1)
-    judged = sightings.judged_from(camera.centre)[place] if len(traces) else np.zeros(0, bool)
+    judged = visibility.judged_from(camera.centre)[place] if len(traces) else np.zeros(0, bool)
     at, edgels, beside = index.agreeing(traces.pixels, traces.along, REACH_PX)
     away = np.linalg.norm(traces.pixels[at] - points[edgels], axis=1)
     distances = np.full(len(traces), np.inf)

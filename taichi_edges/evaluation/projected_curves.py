@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taichi_edges.arrays.ranges import ragged
+from taichi_edges.views.cameras import shares_inside
 
 if TYPE_CHECKING:
     from taichi_edges.views.cameras import Camera
@@ -57,7 +58,7 @@ class Chords:
     def in_image(self, camera: "Camera", spacing: float) -> "Traces":
         """Traces of the chords in an image, sampled at most `spacing` px apart. camera: Camera."""
         one, other = (camera.homogeneous(points) for points in (self.starts, self.ends))
-        low, high = _inside(camera.planes @ one.T, camera.planes @ other.T)
+        low, high = shares_inside(camera.planes @ one.T, camera.planes @ other.T)
         seen = np.flatnonzero(low < high)
         one, other, low, high = one[seen], other[seen], low[seen, None], high[seen, None]
         one, other = one + low * (other - one), one + high * (other - one)
@@ -90,15 +91,3 @@ class Traces:
 
     def __len__(self) -> int:
         return len(self.pixels)
-
-
-def _inside(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(c,) shares between which segments are on the right side of all planes; where low >= high they nowhere are.
-
-    begin, end: (p, c) signed distances of their ends from the planes.
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        crossing = begin / (begin - end)
-    low = np.where((begin < 0) & (end >= 0), crossing, np.where(begin < 0, 1.0, 0.0)).max(axis=0)
-    high = np.where((end < 0) & (begin >= 0), crossing, np.where(end < 0, 0.0, 1.0)).min(axis=0)
-    return low, high

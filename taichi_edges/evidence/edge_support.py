@@ -11,12 +11,13 @@ from functools import cached_property
 import numpy as np
 from scipy.special import gammainc
 
-from taichi_edges.arrays.robust import geman_mcclure
-from taichi_edges.evidence.edgel_matching import MOST_SINE, EdgelMatching
-from taichi_edges.evidence.explaining import BEST_SUPPORTED, NOISE_PER_MEDIAN, TIGHT_NOISES, TIGHT_PX
+from taichi_edges.arrays.robust import NORMAL_MAD, geman_mcclure
+from taichi_edges.evidence.edgel_matching import EdgelMatching
+from taichi_edges.evidence.explaining import BEST_SUPPORTED, TIGHT_NOISES, TIGHT_PX
 from taichi_edges.evidence.lying import EdgelsAbout, steadiness
 from taichi_edges.geometry.shapes import Shape
 from taichi_edges.geometry.wireframe import Evidence
+from taichi_edges.views.edgels import MOST_SINE
 
 SPACING_PX = 0.5  # of the samples of an edge; edgels are about 1 px apart, so that hardly one of them is missed
 MATCH_PX = 1.5  # an edgel within this distance is an edge's, if it is nobody else's
@@ -157,7 +158,7 @@ class Support:
         residuals = np.abs(self.residuals[best][self.edgels[best] >= 0])
         noise = MATCH_PX
         for _ in range(CORE_ROUNDS if len(residuals) else 0):
-            noise = float(NOISE_PER_MEDIAN * np.median(residuals[residuals <= max(CORE * noise, residuals.min())]))
+            noise = float(NORMAL_MAD * np.median(residuals[residuals <= max(CORE * noise, residuals.min())]))
         return noise if len(residuals) else 0.0
 
     @cached_property

@@ -16,9 +16,9 @@ from taichi_edges.kernels.device import download, upload
 from taichi_edges.kernels.edgel_grid import CELL, EdgelGrid
 from taichi_edges.kernels.points import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D, blocks_of, load_camera, load_point
 from taichi_edges.views.cameras import NEAR
+from taichi_edges.views.edgels import MOST_SINE
 from taichi_edges.views.views import Views, pixel_size
 
-MOST_SINE = 0.35  # of the angle between an edgel and a projected direction: 20 degrees, as a bend or noise may turn it
 OWNED_PX, OWNED_MOST = 2.0, 6  # neighbours of an edgel: those so near, itself included, at most so many,
 OWNED_BESIDE_PX = 0.5  # and no farther to the side: an edge may run beside another
 APART = 100.0  # px; views are laid out so far apart when one tree holds the edgels of all of them

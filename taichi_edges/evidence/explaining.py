@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taichi_edges.arrays.columns import Columns
+from taichi_edges.arrays.robust import NORMAL_MAD
 from taichi_edges.evidence.lying import EdgelsAbout, steadiness
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ BESIDE_PX, BESIDE_NOISES = 1.0, 7.0  # the first, or so many times the maps' noi
 TIGHT_PX, TIGHT_NOISES = 0.25, 2.0  # residuals of an edge: within the first, or within so many times the maps' noise
 BEST_SUPPORTED = 0.2  # share of the points whose residuals tell the noise; those of stray points and contours do not
 LEAST_USUAL = 0.3  # steadiness; where the best points have less, there is nothing to compare with
-NOISE_PER_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute value
 VIEWS_AT_ONCE = 16
 
 
@@ -34,14 +34,14 @@ class Explained(Columns):
     """What edgels say about points when each of them counts for one edge alone.
 
     support: (n,) share of the views that have a point in the image in which it lies on an edgel of its own edge.
-    steadiness: (n,) of the edgels near a point's projections that no other edge explains, the share that lies on them;
-    relative to that of the best-supported points, which is below 1 as much as the edgels are noisy.
+    relative_steadiness: (n,) of the edgels near a point's projections that no other edge explains, the share that lies
+    on them, over that of the best-supported points, which is below 1 as much as the edgels are noisy.
     spread: (n,) that of the RefinedPoints: from how different directions they are seen.
     noise_px: standard deviation across the edge of the edgels of the best-supported points.
     """
 
     support: np.ndarray
-    steadiness: np.ndarray
+    relative_steadiness: np.ndarray
     spread: np.ndarray
     noise_px: float
 
@@ -127,7 +127,7 @@ def _noise(matching: "EdgelMatching", best: "RefinedPoints") -> float:
     """Standard deviation, px, of the residuals of the `best` points."""
     parts = [part.residuals[part.there] for part in _in_parts(matching, best, MATCH_PX)]
     residuals = np.concatenate([np.zeros(0), *parts])
-    return float(NOISE_PER_MEDIAN * np.median(np.abs(residuals))) if len(residuals) else 0.0
+    return float(NORMAL_MAD * np.median(np.abs(residuals))) if len(residuals) else 0.0
 
 
 def _steadiness_of_points(

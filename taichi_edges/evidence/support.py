@@ -1,6 +1,6 @@
-"""What the edge maps say for and against single 3D points: strength, width, and support that is not shared.
+"""What the edge maps say for and against single 3D points: the width of the lines, and support that is not shared.
 
-Strength and support are computed by Taichi (imported where it is used): ti.init must have been called.
+Support is computed by Taichi (imported where it is used): ti.init must have been called.
 """
 
 import weakref
@@ -17,20 +17,6 @@ WIDTH_VIEWS = 64  # the width of the lines is measured in so many views at most
 
 # (id of Views, threshold): line width in pixels; an entry goes with its Views.
 known_widths: dict[tuple[int, float], float] = {}
-
-
-def edge_strength(views: Views, points: np.ndarray) -> np.ndarray:
-    """Mean value of the edge maps, 0..1 of full scale, at the projections of (n, 3) unit-cube points.
-
-    Over the views that have the point in front of the camera and inside the image; bilinear; 0 where there is none.
-    """
-    from taichi_edges.evidence.pixel_owners import PixelOwners
-
-    strength = np.zeros(len(points))
-    points, finite = _finite(points)
-    if len(points):
-        strength[finite] = PixelOwners(views, points, 0.5).strength
-    return strength
 
 
 def line_width(views: Views, threshold: float) -> tuple[float, float]:

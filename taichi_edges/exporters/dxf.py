@@ -14,8 +14,8 @@ import numpy as np
 
 from taichi_edges.exporters.naming import edge_name, refuse_empty
 from taichi_edges.exporters.nurbs import DEGREE, joined
-from taichi_edges.exporters.palette import KIND_COLOURS
 from taichi_edges.files.artefacts import replacing
+from taichi_edges.files.palette import KIND_COLOURS
 
 if TYPE_CHECKING:
     from ezdxf.document import Drawing

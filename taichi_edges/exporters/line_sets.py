@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taichi_edges.exporters.naming import confidence_of, edge_name, evidence_words, refuse_empty
-from taichi_edges.exporters.palette import label_colours
 from taichi_edges.files.artefacts import write_text
+from taichi_edges.files.palette import label_colours
 from taichi_edges.files.ply import write_elements
 from taichi_edges.geometry.shapes import polyline
 

@@ -11,9 +11,9 @@ import numpy as np
 from taichi_edges.errors import UserError
 from taichi_edges.exporters.line_sets import line_set_arrays
 from taichi_edges.exporters.naming import confidence_of
-from taichi_edges.exporters.palette import CURVE_COLOUR, LINE_COLOUR
 from taichi_edges.files.artefacts import replacing
-from taichi_edges.views.cameras import NEAR
+from taichi_edges.files.palette import CURVE_COLOUR, LINE_COLOUR
+from taichi_edges.views.cameras import frustum_planes, shares_inside
 from taichi_edges.views.pictures import SAME_SHAPE, read_colour
 from taichi_edges.views.views import Views, choose_views
 
@@ -101,8 +101,8 @@ def draw_edges(picture: np.ndarray, projection: np.ndarray, wireframe: "Wirefram
     height, width = picture.shape[:2]
     stroke = LINE_WIDTH * max(width / REFERENCE_WIDTH, 0.5) * _thinness(len(wireframe))
     points, segments, owners = line_set_arrays(wireframe)
-    homogeneous = points @ projection[:, :3].T + projection[:, 3]
-    planes = frustum_planes(width, height, margin=2 * stroke)
+    homogeneous = np.column_stack([points @ projection[:, :3].T + projection[:, 3], np.ones(len(points))])
+    planes = frustum_planes(width, height, 2 * stroke)  # so that no round line cap shows inside the image
     opacities, straight = _opacities(wireframe), _are_lines(wireframe)
     for is_line, colour in ((True, LINE_COLOUR), (False, CURVE_COLOUR)):
         levels = np.unique(opacities[straight == is_line])  # rising, so that the surer edge is on top
@@ -110,7 +110,7 @@ def draw_edges(picture: np.ndarray, projection: np.ndarray, wireframe: "Wirefram
         clipped = [_pixels(clip_segments(homogeneous[each], planes)) for each in of_level]
         _paint(picture, colour, stroke, list(zip(levels, clipped, strict=True)))
     vertices, degrees = homogeneous[: len(wireframe.vertices)], wireframe.degrees
-    visible = (vertices[:, 2] >= NEAR) & (vertices @ planes.T >= 0).all(axis=1)
+    visible = (vertices @ planes.T >= 0).all(axis=1)
     for ring, which in ((False, degrees > 1), (True, degrees == 1)):
         _mark(picture, _pixels(vertices[visible & which]), stroke, ring)
     return picture
@@ -122,8 +122,8 @@ def _thinness(count: int) -> float:
 
 
 def _pixels(homogeneous: np.ndarray) -> np.ndarray:
-    """(..., 3) homogeneous pixels, all in front of the camera -> (..., 2)."""
-    return homogeneous[..., :2] / homogeneous[..., 2:]
+    """(..., 4) homogeneous pixels, all in front of the camera -> (..., 2)."""
+    return homogeneous[..., :2] / homogeneous[..., 2:3]
 
 
 def _opacities(wireframe: "Wireframe") -> np.ndarray:
@@ -149,29 +149,14 @@ def _mark(picture: np.ndarray, pixels: np.ndarray, stroke: float, ring: bool) ->
     _paint(picture, DOT_COLOUR, RING_STROKE * stroke, [(1.0, (pixels[:, None, None] + sides).reshape(-1, 2, 2))])
 
 
-def frustum_planes(width: int, height: int, margin: float) -> np.ndarray:
-    """(5, 3) planes: a . (uz, vz, z) >= 0 holds in the visible region. Near (at depth 0), left, right, top, bottom.
-
-    margin: pixels around the image that still count, so that no round line cap shows inside it.
-    """
-    right, bottom = width - 1 + margin, height - 1 + margin
-    return np.array([[0, 0, 1], [1, 0, margin], [-1, 0, right], [0, 1, margin], [0, -1, bottom]], dtype=np.float64)
-
-
 def clip_segments(segments: np.ndarray, planes: np.ndarray) -> np.ndarray:
     """Cut segments to the visible region before the division by depth, so that nothing wraps round behind the camera.
 
-    segments: (m, 2, 3) homogeneous pixels (uz, vz, z). planes: (5, 3). Returns the visible parts, (k, 2, 3).
+    segments: (m, 2, 4) homogeneous pixels (uz, vz, z, 1). planes: (5, 4). Returns the visible parts, (k, 2, 4).
     """
-    values = segments @ planes.T  # (m, 2, 5) signed distances
-    values[:, :, 0] -= NEAR  # not 0, where the division by depth ends
-    start, end = values[:, 0], values[:, 1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        crossing = start / (start - end)
-    first = np.where((start < 0) & (end >= 0), crossing, 0.0).max(axis=1)
-    last = np.where((start >= 0) & (end < 0), crossing, 1.0).min(axis=1)
-    kept = (first < last) & ~((start < 0) & (end < 0)).any(axis=1)
-    at = np.stack([first, last], axis=1)[kept, :, None]
+    low, high = shares_inside(planes @ segments[:, 0].T, planes @ segments[:, 1].T)
+    kept = low < high
+    at = np.stack([low, high], axis=1)[kept, :, None]
     return segments[kept, :1] * (1.0 - at) + segments[kept, 1:] * at
 
 

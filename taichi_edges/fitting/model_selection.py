@@ -14,7 +14,7 @@ import numpy as np
 from taichi_edges.fitting.arcs import Arc, fit_arc, through_three
 from taichi_edges.fitting.cubic_chains import Ordering, fit_chain
 from taichi_edges.fitting.distances import distances_to, unit
-from taichi_edges.fitting.prices import CUBIC_PRICE, MOST_CUBICS, NEXT_CUBIC_PRICE, OUTLIER, PRICES, price_of
+from taichi_edges.fitting.prices import MOST_CUBICS, OUTLIER, PRICES, price_of, price_of_cubics
 from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline
 
 LEAST_BEND = 1.0  # noises that the middle of an arc is off its chord, at least
@@ -100,10 +100,8 @@ def shape_candidates(track: Track, yardstick: Yardstick) -> list[tuple[int, Fit]
         found.append((PRICES["line"], lambda: fitted_line(track, tolerance).shape()))
     found.append((PRICES["circle" if track.closed else "arc"], partial(bent_shape, track, tolerance)))
     found.append((PRICES["ellipse" if track.closed else "elliptic_arc"], partial(fitted_ellipse, track)))
-    for cubics in range(4 if track.closed else 1, MOST_CUBICS + 1):
-        if len(track.points) >= 6 * cubics:
-            price = CUBIC_PRICE + NEXT_CUBIC_PRICE * (cubics - 1)
-            found.append((price, partial(fitted_spline, track, tolerance, cubics)))
+    counts = [n for n in range(4 if track.closed else 1, MOST_CUBICS + 1) if len(track.points) >= 6 * n]
+    found += [(price_of_cubics(cubics), partial(fitted_spline, track, tolerance, cubics)) for cubics in counts]
     return sorted(found, key=lambda pair: pair[0])
 
 

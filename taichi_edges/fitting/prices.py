@@ -7,20 +7,28 @@ from taichi_edges.geometry.shapes import Shape, Spline
 if TYPE_CHECKING:
     from taichi_edges.fitting.arcs import Arc
 
-LINE_PRICE, ARC_PRICE = 5, 8  # free parameters: a line and where it ends; an arc, which has a plane and a bend as well
 OUTLIER = 9.0  # squared noises that one observation can cost: three standard deviations
-PRICES = {"line": 6, "arc": 9, "circle": 6, "elliptic_arc": 10, "ellipse": 8}  # free parameters, with those of the ends
-CUBIC_PRICE, NEXT_CUBIC_PRICE = 12, 6  # of a cubic, and of one more in a smooth chain
+# Free parameters of whole edges: a line has its two ends, an arc is counted as three points.
+PRICES = {"line": 6, "arc": 9, "circle": 6, "elliptic_arc": 10, "ellipse": 8}
+# Among points, stretches follow each other: where one ends the next begins, so of the two ends one costs. Both tables
+# charge three for a bend, and so choose alike between a line and an arc.
+LINE_PRICE, ARC_PRICE = PRICES["line"] - 1, PRICES["arc"] - 1
+CUBIC_PRICE, NEXT_CUBIC_PRICE = 12, 6  # of a cubic, and of one more in a smooth chain; as a whole edge and among points
 MOST_CUBICS = 4  # of an open chain
 
 
 def price_of_arc(arc: "Arc") -> int:
-    """Free parameters of a line or an arc with its ends."""
+    """Free parameters of a line or an arc among points."""
     return LINE_PRICE if arc.curvature == 0 else ARC_PRICE
 
 
+def price_of_cubics(count: int) -> int:
+    """Free parameters of a smooth chain of cubics."""
+    return CUBIC_PRICE + NEXT_CUBIC_PRICE * (count - 1)
+
+
 def price_of(shape: Shape) -> int:
-    """Number of free parameters of a shape, with its ends."""
+    """Free parameters of a shape that is a whole edge."""
     if isinstance(shape, Spline):
-        return CUBIC_PRICE + NEXT_CUBIC_PRICE * (len(shape.curves) - 1)
+        return price_of_cubics(len(shape.curves))
     return PRICES[shape.kind]

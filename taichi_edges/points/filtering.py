@@ -133,7 +133,7 @@ def refined_points(
 
 
 @dataclass(frozen=True)
-class Judgement(Columns):
+class Trust(Columns):
     """What is thought of n RefinedPoints, whose Explained is `explained`.
 
     supported: (n,) bool, which of them have edgels of their own. steady: (n,) bool, which of these stay on them as the
@@ -155,8 +155,8 @@ class Judgement(Columns):
         return int((self.supported & ~self.steady).sum())
 
 
-def judge(matching: "EdgelMatching", refined: "RefinedPoints", config: "FilterConfig") -> Judgement:
-    """The Judgement of RefinedPoints.
+def judge(matching: "EdgelMatching", refined: "RefinedPoints", config: "FilterConfig") -> Trust:
+    """The Trust of RefinedPoints.
 
     An occluding contour is not steady: its support comes from views that happen to look from similar directions.
     Steadiness is a matter of an edge and not of a point, so the median of a neighbourhood decides, and leniently: there
@@ -170,9 +170,9 @@ def judge(matching: "EdgelMatching", refined: "RefinedPoints", config: "FilterCo
     steady, places = supported.copy(), refined.points[supported]
     if len(places):
         around = cKDTree(places).query(places, min(AROUND, len(places)))[1].reshape(len(places), -1)
-        typical = np.median(explained.steadiness[supported][around], axis=1)
+        typical = np.median(explained.relative_steadiness[supported][around], axis=1)
         steady[supported] = typical >= config.min_steadiness
-    return Judgement(supported, steady, explained)
+    return Trust(supported, steady, explained)
 
 
 def harvest(

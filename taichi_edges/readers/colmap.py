@@ -9,7 +9,7 @@ import numpy as np
 from taichi_edges.errors import UserError, name_some
 from taichi_edges.readers.companions import edge_paths, is_picture, mask_paths
 from taichi_edges.readers.frames import Frames
-from taichi_edges.readers.photogrammetry import Reconstruction, model_files, read_reconstruction
+from taichi_edges.readers.photogrammetry import SfmModel, model_files, read_model
 from taichi_edges.readers.scene_box import scene_box
 
 if TYPE_CHECKING:
@@ -22,14 +22,14 @@ IMAGE_FOLDERS = ("images", "")
 def read_colmap(folder: Path, config: "SourceConfig") -> Frames:
     """Frames of a COLMAP project. config: the scene's `source` section."""
     model, notes = find_model(folder, config.model)
-    return frames_of_model(folder, model, _image_folder(folder, config, read_reconstruction(model)), config, notes)
+    return frames_of_model(folder, model, _image_folder(folder, config, read_model(model)), config, notes)
 
 
 def frames_of_model(
     folder: Path, model: Path, images: Path, config: "SourceConfig", notes: tuple[str, ...] = ()
 ) -> Frames:
     """Frames of the COLMAP model in the folder `model`. folder: of edge maps and masks. images: of the images."""
-    files, found = model_files(model), read_reconstruction(model)
+    files, found = model_files(model), read_model(model)
     where = next(path for path in files if path.stem == "images")
     if not found.names:
         raise UserError(f"{where}: the model has no registered image; run the mapper again")
@@ -82,7 +82,7 @@ def _numbered(path: Path) -> tuple[int, str]:
 def _largest(models: list[Path], folder: Path) -> tuple[Path, tuple[str, ...]]:
     if len(models) == 1:
         return models[0], ()
-    counts = [len(read_reconstruction(model).names) for model in models]
+    counts = [len(read_model(model).names) for model in models]
     best = int(np.argmax(counts))
     each = ", ".join(f"{m.relative_to(folder)} with {count}" for m, count in zip(models, counts, strict=True))
     chosen = models[best].relative_to(folder)
@@ -90,7 +90,7 @@ def _largest(models: list[Path], folder: Path) -> tuple[Path, tuple[str, ...]]:
     return models[best], (note,)
 
 
-def _image_folder(folder: Path, config: "SourceConfig", found: Reconstruction) -> Path:
+def _image_folder(folder: Path, config: "SourceConfig", found: SfmModel) -> Path:
     """Where the images are: `source.images`, or the first usual folder that holds one of them."""
     if config.images:
         return folder / config.images
@@ -105,7 +105,7 @@ def _view_names(names: Sequence[str]) -> list[str]:
     return stems if len(set(stems)) == len(stems) else list(names)
 
 
-def _good_points(found: Reconstruction, config: "SourceConfig") -> np.ndarray:
+def _good_points(found: SfmModel, config: "SourceConfig") -> np.ndarray:
     """(n, 3) the points that fit and that enough images see: one seen in two lies anywhere along their rays."""
     good = (found.errors <= config.max_point_error) & (found.track_lengths >= config.min_track)
     return found.points[good & np.isfinite(found.points).all(axis=1)]

@@ -82,7 +82,7 @@ class Lens:
 
 
 @dataclass(frozen=True)
-class Reconstruction:
+class SfmModel:
     """A model of structure from motion, in its own frame.
 
     names: (V,) of the registered images. lenses: (V,). camera_to_world: (V, 4, 4), OpenCV axes.
@@ -109,18 +109,18 @@ def model_files(folder: Path) -> list[Path]:
     return []
 
 
-def read_reconstruction(folder: Path) -> Reconstruction:
-    """The Reconstruction of a folder with `model_files`; read once, as long as the files stay the same."""
-    return _reconstruction_of(folder, tuple(file_state(path) for path in model_files(folder)))
+def read_model(folder: Path) -> SfmModel:
+    """The SfmModel of a folder with `model_files`; read once, as long as the files stay the same."""
+    return _model_of(folder, tuple(file_state(path) for path in model_files(folder)))
 
 
 @functools.lru_cache(maxsize=8)
-def _reconstruction_of(folder: Path, _states: tuple[tuple[int, ...], ...]) -> Reconstruction:
+def _model_of(folder: Path, _states: tuple[tuple[int, ...], ...]) -> SfmModel:
     pycolmap = _colmap()
     try:
         model = pycolmap.Reconstruction(str(folder))
         _refuse_cut_cameras(folder / "cameras.bin", model)
-        return as_reconstruction(model)
+        return as_model(model)
     except (ValueError, RuntimeError, IndexError, MemoryError) as error:
         reason = str(error) or type(error).__name__
         raise UserError(f"{folder}: not a COLMAP model that can be read ({reason}); export or copy it again") from error
@@ -133,12 +133,12 @@ def _refuse_cut_cameras(path: Path, model: "pycolmap.Reconstruction") -> None:
         raise ValueError(f"{path.name} is truncated")
 
 
-def as_reconstruction(model: "pycolmap.Reconstruction") -> Reconstruction:
-    """The Reconstruction of a pycolmap Reconstruction."""
+def as_model(model: "pycolmap.Reconstruction") -> SfmModel:
+    """The SfmModel of a pycolmap Reconstruction."""
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     lenses = {number: _lens(camera) for number, camera in model.cameras.items()}
     points = list(model.points3D.values())
-    return Reconstruction(
+    return SfmModel(
         names=[image.name for image in images],
         lenses=[lenses[image.camera_id] for image in images],
         camera_to_world=np.array([_camera_to_world(image) for image in images]).reshape(-1, 4, 4),
@@ -177,7 +177,7 @@ def distorted_pixels(lens: Lens, rays: np.ndarray) -> np.ndarray:
     return np.asarray(pixels) - HALF_PIXEL
 
 
-def reconstruct(
+def solve_poses(
     images: Path,
     names: Sequence[str],
     groups: Sequence[list[str]],

@@ -15,7 +15,7 @@ from taichi_edges.readers.colmap import frames_of_model
 from taichi_edges.readers.companions import edge_paths, is_picture, mask_folder, mask_paths
 from taichi_edges.readers.frames import Frames, is_usable
 from taichi_edges.readers.images import read_mask
-from taichi_edges.readers.photogrammetry import colmap_version, known_focal_length, model_files, reconstruct
+from taichi_edges.readers.photogrammetry import colmap_version, known_focal_length, model_files, solve_poses
 from taichi_edges.views.picture_sizes import picture_size
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ def _solved(
     _refuse_few(images, readable)
     with TemporaryDirectory() as folder_of_masks:
         named = _named_masks(masks, Path(folder_of_masks)) if masks else None
-        registered = reconstruct(images, readable, groups, cache, seed, threads, progress, named)
+        registered = solve_poses(images, readable, groups, cache, seed, threads, progress, named)
     return {
         "registered": registered,
         "unreadable": [name for name in names if name not in grouped],

@@ -158,7 +158,7 @@ def adjusted(
     relations: Iterable[Constraint] = (),
     radii: Sequence[float] = RADII_PX,
 ) -> Wireframe:
-    """The Wireframe whose edges agree best with the edgels of all views, without evidence (see `evidence.evidence_of`).
+    """The Wireframe whose edges agree best with the edgels of all views, without evidence (see `edge_support`).
 
     matching: EdgelMatching. relations: Constraints. radii: px, one for each round.
     """

@@ -21,7 +21,7 @@ from taichi_edges.evidence.edge_support import Support, support_of
 from taichi_edges.evidence.lying import EdgelsAbout
 from taichi_edges.geometry.shapes import Line, Shape
 from taichi_edges.refinement.anchors import BEYOND_PX, Anchors, anchors_of
-from taichi_edges.refinement.straight_runs import LEAST_LENGTH_PX, Runs, runs_of
+from taichi_edges.refinement.straight_runs import LEAST_LENGTH_PX, StraightRuns, runs_of
 from taichi_edges.views.cameras import Cameras
 
 if TYPE_CHECKING:
@@ -106,8 +106,8 @@ class Lines(Columns):
         return (self.extents[:, 1] - self.extents[:, 0]) * np.linalg.norm(self.ways, axis=1)
 
 
-def hypotheses(runs: Runs, anchors: Anchors) -> Lines:
-    """The Lines through pairs of anchors of Runs with which most others agree, at most TRIED for each run."""
+def hypotheses(runs: StraightRuns, anchors: Anchors) -> Lines:
+    """The Lines through pairs of anchors of StraightRuns with which most others agree, at most TRIED for each run."""
     counts = np.bincount(anchors.runs, minlength=len(runs))
     starts = np.cumsum(counts) - counts
     several: list[Lines] = []
@@ -119,8 +119,8 @@ def hypotheses(runs: Runs, anchors: Anchors) -> Lines:
     return Lines.joined(several)
 
 
-def proposed(runs: Runs, anchors: Anchors) -> list[Lines]:
-    """Lists of Lines for r Runs with c anchors each. anchors: Anchors with arrays (r, c, ..)."""
+def proposed(runs: StraightRuns, anchors: Anchors) -> list[Lines]:
+    """Lists of Lines for r StraightRuns with c anchors each. anchors: Anchors with arrays (r, c, ..)."""
     lengths, points, ways, sizes = runs.lengths, anchors.points, anchors.ways, anchors.sizes
     first, second = np.triu_indices(points.shape[1], 1)
     agree = on_lines(points, first, second, sizes)  # (r, p, c)
@@ -170,7 +170,7 @@ def extents_of(lengths: np.ndarray, ways: np.ndarray, sizes: np.ndarray) -> tupl
 
 
 @dataclass(frozen=True)
-class Sight:
+class Sightings:
     """What the views show at places along some Lines.
 
     lines: (m,) index of the line. parameters: (m,). edgels: (m, V) index, -1 none that is free. seen: (m, V) bool,
@@ -183,7 +183,7 @@ class Sight:
     seen: np.ndarray
 
     @staticmethod
-    def of(matching: "EdgelMatching", lines: Lines, free: np.ndarray, spacing: float) -> "Sight":
+    def of(matching: "EdgelMatching", lines: Lines, free: np.ndarray, spacing: float) -> "Sightings":
         """spacing: px. free: (e,) bool, the edgels that count."""
         counts = np.maximum(np.round(lines.lengths / (spacing * lines.sizes)), 4).astype(np.int64)
         owners, number = ragged(counts)
@@ -194,7 +194,7 @@ class Sight:
         way = way / np.linalg.norm(way, axis=1, keepdims=True)
         about = EdgelsAbout.of(matching, points, way, SHOWN_PX)
         edgels = np.where(np.append(free, False)[about.edgels], about.edgels, -1)
-        return Sight(owners, parameters, edgels, about.inside)
+        return Sightings(owners, parameters, edgels, about.inside)
 
     def shares(self, count: int) -> np.ndarray:
         """(L, V) share of the places of each of the lines that a view has and shows; of them all."""
@@ -215,25 +215,25 @@ def shown(matching: "EdgelMatching", lines: Lines, free: np.ndarray, seen: np.nd
     seen: (S, V) bool, which views show which shapes. A view that shows both shapes on which a line is anchored should
     show it, too; where it has the depth of something in front of it, neighbouring views do and others do not.
     """
-    sight = Sight.of(matching, lines, free, SPACING_PX)
-    enough = (sight.edgels >= 0).sum(axis=1) >= LEAST_VIEWS
-    lines, kept = clipped(lines, sight, enough)
+    sightings = Sightings.of(matching, lines, free, SPACING_PX)
+    enough = (sightings.edgels >= 0).sum(axis=1) >= LEAST_VIEWS
+    lines, kept = clipped(lines, sightings, enough)
     lines = lines.keep(kept)
-    sight = Sight.of(matching, lines, free, SPACING_PX)
-    views = sight.shares(len(lines)) >= SHOWN
+    sightings = Sightings.of(matching, lines, free, SPACING_PX)
+    views = sightings.shares(len(lines)) >= SHOWN
     expected = seen[lines.shapes].all(axis=1)
     agreed = (views & expected).sum(axis=1) >= EXPECTED * expected.sum(axis=1)
     return lines.keep(agreed & (views.sum(axis=1) >= LEAST_VIEWS))
 
 
-def clipped(lines: Lines, sight: Sight, enough: np.ndarray) -> tuple[Lines, np.ndarray]:
+def clipped(lines: Lines, sightings: Sightings, enough: np.ndarray) -> tuple[Lines, np.ndarray]:
     """The Lines cut to where most places are shown by enough views, (m,) bool, and (n,) bool, whether that is a line.
 
     Of all stretches the one with the greatest surplus of places that are shown over SHOWN of them.
     """
     gain, extents = np.where(enough, 1.0 - SHOWN, -SHOWN), lines.extents.copy()
-    starts = np.searchsorted(sight.lines, np.arange(len(lines) + 1))
-    for line in np.unique(sight.lines[enough]):
+    starts = np.searchsorted(sightings.lines, np.arange(len(lines) + 1))
+    for line in np.unique(sightings.lines[enough]):
         part = slice(starts[line], starts[line + 1])
         total = np.concatenate([[0.0], np.cumsum(gain[part])])
         lowest = np.minimum.accumulate(total)
@@ -241,7 +241,7 @@ def clipped(lines: Lines, sight: Sight, enough: np.ndarray) -> tuple[Lines, np.n
         first = int(np.argmin(total[: last + 1]))
         step = (lines.extents[line, 1] - lines.extents[line, 0]) / (part.stop - part.start)
         extents[line] = lines.extents[line, 0] + step * np.array([first, last])
-    shown = np.bincount(sight.lines, enough, len(lines)) > 0
+    shown = np.bincount(sightings.lines, enough, len(lines)) > 0
     lines = replace(lines, extents=extents)
     lines = replace(lines, extents=np.where(lines.at_anchors, [0.0, 1.0], extents))
     return lines, shown & (lines.lengths >= LEAST_LENGTH_PX * lines.sizes)
@@ -255,17 +255,17 @@ def distinct(lines: Lines, matching: "EdgelMatching", free: np.ndarray) -> list[
 
     free: (e,) bool, the edgels that no known shape has.
     """
-    sight = Sight.of(matching, lines, free, 0.5 * SPACING_PX)
-    ballot = Ballot.of(lines, sight, len(free))
-    support = np.bincount(sight.lines, (sight.edgels >= 0).sum(axis=1), len(lines))
-    starts = np.searchsorted(sight.lines, np.arange(len(lines) + 1))
-    owners, extents, kept, elected = np.full(len(free), -1), lines.extents.copy(), [], ballot.elected
-    for line in np.lexsort((-support, -ballot.worth)).tolist():
-        found = np.unique(sight.edgels[starts[line] : starts[line + 1]])
+    sightings = Sightings.of(matching, lines, free, 0.5 * SPACING_PX)
+    line_votes = LineVotes.of(lines, sightings, len(free))
+    support = np.bincount(sightings.lines, (sightings.edgels >= 0).sum(axis=1), len(lines))
+    starts = np.searchsorted(sightings.lines, np.arange(len(lines) + 1))
+    owners, extents, kept, accepted = np.full(len(free), -1), lines.extents.copy(), [], line_votes.accepted
+    for line in np.lexsort((-support, -line_votes.worth)).tolist():
+        found = np.unique(sightings.edgels[starts[line] : starts[line + 1]])
         found = found[found >= 0]
         others = owners[found]
         if (others >= 0).mean() < CLAIMED:
-            if elected[line]:
+            if accepted[line]:
                 kept.append(line)
                 owners[found[others < 0]] = line
             continue
@@ -279,7 +279,7 @@ def distinct(lines: Lines, matching: "EdgelMatching", free: np.ndarray) -> list[
 
 
 @dataclass(frozen=True)
-class Ballot:
+class LineVotes:
     """How well some Lines are founded.
 
     Which known edges a run happens to cross in the image changes with the viewpoint, and so does where a line through
@@ -293,30 +293,30 @@ class Ballot:
     rivals: np.ndarray
 
     @staticmethod
-    def of(lines: Lines, sight: Sight, count: int) -> "Ballot":
-        """sight: of the Lines. count: of edgels."""
-        place, view = np.nonzero(sight.edgels >= 0)
+    def of(lines: Lines, sightings: Sightings, count: int) -> "LineVotes":
+        """sightings: of the Lines. count: of edgels."""
+        place, view = np.nonzero(sightings.edgels >= 0)
         shape, entries = (len(lines), count), np.ones(len(place), np.int32)
-        owned = csr_matrix((entries, (sight.lines[place], sight.edgels[place, view])), shape=shape)
+        owned = csr_matrix((entries, (sightings.lines[place], sightings.edgels[place, view])), shape=shape)
         owned.data[:] = 1
         total, common = np.asarray(owned.sum(axis=1))[:, 0], (owned @ owned.T).tocoo()
         alike = common.data >= OVERLAP * np.minimum(total[common.row], total[common.col])
         one, other = common.row[alike], common.col[alike]
         same = beside(lines, one, lines.ends[other])[1] <= SAME_PX * lines.sizes[one]
-        votes = voters(one[same], lines.views[other[same]], len(lines))
+        votes = votes_of(one[same], lines.views[other[same]], len(lines))
         closed = np.bincount(one[same], lines.closed[other[same]], len(lines))
         worth = votes + closed / np.maximum(np.bincount(one[same], minlength=len(lines)), 1)
         rivals = np.zeros(len(lines))
         np.maximum.at(rivals, one[~same], worth[other[~same]])
-        return Ballot(votes, worth, rivals)
+        return LineVotes(votes, worth, rivals)
 
     @property
-    def elected(self) -> np.ndarray:
+    def accepted(self) -> np.ndarray:
         """(n,) bool: the lines that enough views propose, and that no other one for their edgels beats."""
         return (self.votes >= LEAST_VOTES) & (self.worth >= LEAST_WORTH) & (self.worth >= self.rivals)
 
 
-def voters(lines: np.ndarray, views: np.ndarray, count: int) -> np.ndarray:
+def votes_of(lines: np.ndarray, views: np.ndarray, count: int) -> np.ndarray:
     """(count,) number of different views that are paired with each of the lines."""
     pairs = np.unique(np.column_stack([lines, views]), axis=0)
     return np.bincount(pairs[:, 0], minlength=count)

@@ -12,7 +12,7 @@ from taichi_edges.arrays.ranges import ragged
 from taichi_edges.geometry.shapes import Shape
 
 if TYPE_CHECKING:
-    from taichi_edges.refinement.straight_runs import Runs
+    from taichi_edges.refinement.straight_runs import StraightRuns
     from taichi_edges.views.cameras import Cameras
 
 BEYOND_PX = 8.0  # between the ends of edges that meet, see `junctions.REACH_PX`
@@ -44,8 +44,8 @@ class Anchors(Columns):
         return Anchors.joined([self, replace(others, shapes=others.shapes + count)]).sorted()
 
 
-def anchors_of(runs: "Runs", shapes: Sequence[Shape], cameras: "Cameras", pixel: float) -> Anchors:
-    """The Anchors of Runs on shapes. pixel: unit-cube units."""
+def anchors_of(runs: "StraightRuns", shapes: Sequence[Shape], cameras: "Cameras", pixel: float) -> Anchors:
+    """The Anchors of StraightRuns on shapes. pixel: unit-cube units."""
     pieces = pieces_of(shapes, pixel)
     found, piece = near_pairs(runs, pieces, cameras)
     views, starts = runs.views[found], runs.ends[found, 0]
@@ -79,7 +79,7 @@ def once(anchors: Anchors) -> Anchors:
 
 
 @dataclass(frozen=True)
-class Pieces:
+class ShapePieces:
     """Short straight pieces of shapes. points: (n, 3) their middles. halves: (n, 3) from there to an end.
 
     shapes: (n,) indices.
@@ -90,20 +90,20 @@ class Pieces:
     shapes: np.ndarray
 
 
-def pieces_of(shapes: Sequence[Shape], pixel: float) -> Pieces:
-    """The Pieces of shapes; lines and arcs go on a little beyond their ends."""
+def pieces_of(shapes: Sequence[Shape], pixel: float) -> ShapePieces:
+    """The ShapePieces of shapes; lines and arcs go on a little beyond their ends."""
     points, halves, counts = [np.zeros((0, 3))], [np.zeros((0, 3))], []
     for shape in shapes:
         beyond = BEYOND_PX * pixel / shape.length if shape.kind in ("line", "arc") else 0.0
         count = max(int(np.ceil(shape.length * (1 + 2 * beyond) / (SHAPE_PX * pixel))), 1)
-        joints = shape.at(np.linspace(-beyond, 1 + beyond, count + 1))
-        points.append(0.5 * (joints[1:] + joints[:-1]))
-        halves.append(0.5 * (joints[1:] - joints[:-1]))
+        bounds = shape.at(np.linspace(-beyond, 1 + beyond, count + 1))
+        points.append(0.5 * (bounds[1:] + bounds[:-1]))
+        halves.append(0.5 * (bounds[1:] - bounds[:-1]))
         counts.append(count)
-    return Pieces(np.concatenate(points), np.concatenate(halves), np.repeat(np.arange(len(shapes)), counts))
+    return ShapePieces(np.concatenate(points), np.concatenate(halves), np.repeat(np.arange(len(shapes)), counts))
 
 
-def near_pairs(runs: "Runs", pieces: Pieces, cameras: "Cameras") -> tuple[np.ndarray, np.ndarray]:
+def near_pairs(runs: "StraightRuns", pieces: ShapePieces, cameras: "Cameras") -> tuple[np.ndarray, np.ndarray]:
     """(k,) runs and (k,) pieces that come close to each other in the run's view, each pair once."""
     found, piece = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     every = np.arange(len(pieces.points))
@@ -120,7 +120,7 @@ def near_pairs(runs: "Runs", pieces: Pieces, cameras: "Cameras") -> tuple[np.nda
     return np.concatenate(found), np.concatenate(piece)
 
 
-def places_on(runs: "Runs", chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def places_on(runs: "StraightRuns", chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(m, 2) px places on the chosen runs, some beyond their ends, and (m,) the run of each."""
     counts = np.ceil((runs.lengths[chosen] + 2 * BEYOND_PX) / PLACE_PX).astype(np.int64) + 1
     of, number = ragged(counts)

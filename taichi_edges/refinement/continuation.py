@@ -20,9 +20,9 @@ from taichi_edges.geometry.shapes import EllipticArc, Shape, bounds_of, near_bou
 
 BESIDE = 3.0  # noises: places so near to a shape are on it
 PARALLEL = np.cos(np.radians(20.0))
-JOINT_COSINE = np.cos(np.radians(25.0))  # between the tangents of two strokes that continue each other
-JOINT_GAP_PX = 12.0  # between their ends, along; a tail or a gap at a touching edge is as long
-JOINT_ASIDE = 0.25  # of that gap: how far aside the other end may lie, beyond BESIDE
+CONTINUED_COSINE = np.cos(np.radians(25.0))  # between the tangents of two strokes that continue each other
+CONTINUED_GAP_PX = 12.0  # between their ends, along; a tail or a gap at a touching edge is as long
+CONTINUED_ASIDE = 0.25  # of that gap: how far aside the other end may lie, beyond BESIDE
 SPACING_PX = 2.0  # of the places by which strokes are compared
 ROUNDING = 1e-9  # relative; what is cheaper by no more is not cheaper
 LEAST_LOOP = 4.0  # times that gap: length of a stroke whose end may continue its start
@@ -37,7 +37,7 @@ LEAST_GAP_VIEWS = 1.0  # and by one at least
 REPEATED = 0.9  # of the places of a stroke beside others, from which on it says nothing new
 
 Seen = Callable[[Shape, np.ndarray], np.ndarray]  # (n,) how many views see a shape at (n,) parameters
-End = tuple[int, int]  # number of the shape, side 0 or 1
+ShapeEnd = tuple[int, int]  # number of the shape, side 0 or 1
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Stroke:
 
 
 def continued(
-    shapes: Sequence[Shape], yardstick: Yardstick, seen: Seen, gap_px: float = JOINT_GAP_PX
+    shapes: Sequence[Shape], yardstick: Yardstick, seen: Seen, gap_px: float = CONTINUED_GAP_PX
 ) -> tuple[list[Shape], Merging]:
     """The shapes after all three passes, and Merging.
 
@@ -193,7 +193,9 @@ def on_shape(shape: Shape, track: Track, yardstick: Yardstick) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------------- smooth paths
 
 
-def rejoined(shapes: Sequence[Shape], yardstick: Yardstick, seen: Seen, gap_px: float = JOINT_GAP_PX) -> list[Shape]:
+def rejoined(
+    shapes: Sequence[Shape], yardstick: Yardstick, seen: Seen, gap_px: float = CONTINUED_GAP_PX
+) -> list[Shape]:
     """The shapes, each path of strokes that continue each other cut anew into as few as pay."""
     whole: list[Shape] = []
     spacing = SPACING_PX * yardstick.pixel
@@ -220,7 +222,7 @@ def smooth_paths(
 
     Every shape is in one of them.
     """
-    partner = stroke_joints(shapes, yardstick, gap_px)
+    partner = partners_of_ends(shapes, yardstick, gap_px)
     paths: list[tuple[list[tuple[int, bool]], bool]] = []
     seen: set[int] = set()
     ends = [(number, side) for number, shape in enumerate(shapes) for side in (0, 1)]
@@ -229,7 +231,7 @@ def smooth_paths(
         if number in seen:
             continue
         path, start = [], (number, side)
-        onward: End | None = start
+        onward: ShapeEnd | None = start
         while onward is not None and onward[0] not in seen:
             number, side = onward
             seen.add(number)
@@ -239,7 +241,7 @@ def smooth_paths(
     return paths
 
 
-def stroke_joints(shapes: Sequence[Shape], yardstick: Yardstick, gap_px: float) -> dict[End, End]:
+def partners_of_ends(shapes: Sequence[Shape], yardstick: Yardstick, gap_px: float) -> dict[ShapeEnd, ShapeEnd]:
     """{(shape, side): (shape, side)} of ends that continue each other, each the best for the other."""
     ends = [(number, side) for number, shape in enumerate(shapes) if not shape.closed for side in (0, 1)]
     if len(ends) < 2:
@@ -249,16 +251,16 @@ def stroke_joints(shapes: Sequence[Shape], yardstick: Yardstick, gap_px: float) 
     found, gap = [], gap_px * yardstick.pixel
     for i, j in sorted(cKDTree(places).query_pairs(gap)):
         same = ends[i][0] == ends[j][0] and shapes[ends[i][0]].length < LEAST_LOOP * gap
-        if same or outward[i] @ outward[j] > -JOINT_COSINE:
+        if same or outward[i] @ outward[j] > -CONTINUED_COSINE:
             continue
         step = places[j] - places[i]
         along = unit(outward[i] - outward[j])
         aside = np.linalg.norm(step - (step @ along) * along)
-        if aside <= BESIDE * yardstick.noise + JOINT_ASIDE * abs(step @ along):
+        if aside <= BESIDE * yardstick.noise + CONTINUED_ASIDE * abs(step @ along):
             turn = np.arccos(np.clip(-outward[i] @ outward[j], -1, 1))
             ahead = abs(step @ along) / (4 * yardstick.pixel)
             found.append((aside / yardstick.noise + turn / np.radians(5.0) + ahead, i, j))
-    partner: dict[End, End] = {}
+    partner: dict[ShapeEnd, ShapeEnd] = {}
     for _, i, j in sorted(found):
         if ends[i] not in partner and ends[j] not in partner:
             partner[ends[i]], partner[ends[j]] = ends[j], ends[i]

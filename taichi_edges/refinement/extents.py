@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline
-from taichi_edges.refinement.continuation import GAP_SEEN, LEAST_GAP_VIEWS, Seen
+from taichi_edges.refinement.continuation import GAP_SEEN, LEAST_GAP_VIEWS
 
 AHEAD_PX = 40.0  # looked beyond an end; a longer way takes another round
 LOST_PX = 4.0  # an edge that the images do not show for so long has ended
@@ -16,23 +16,16 @@ ROUNDS = 4
 Question = tuple[Shape, np.ndarray]  # a shape, and (n,) parameters of places on it
 
 
-def extended(shape: Shape, sides: Sequence[int], seen: Seen, pixel: float) -> Shape:
-    """A line or an arc, its ends on the given sides moved outwards as far as the images show it; others as they are.
-
-    seen: function of a shape and (n,) parameters: how many views see an edge there that is nobody else's.
-    """
-    return all_extended([shape], [sides], lambda numbers, places: [seen(*places[0])], pixel)[0]
-
-
-def all_extended(
+def extended(
     shapes: Sequence[Shape],
     sides: Sequence[Sequence[int]],
     seen: Callable[[list[int], list[Question]], list[np.ndarray]],
     pixel: float,
 ) -> list[Shape]:
-    """`extended` for shapes with the sides of each, one step of all of them at a time.
+    """Lines and arcs, their ends on the given sides moved outwards as far as the images show them; others as they are.
 
-    seen: function of the indices of some shapes and [(shape, parameters)] as these are by now.
+    sides: those of each shape. seen: function of the indices of some shapes and [(shape, parameters)] as these are by
+    now: how many views see an edge there that is nobody else's. One step of all shapes at a time is asked about.
     """
     found = list(shapes)
     steps = {n: _steps(shape, own, pixel) for n, (shape, own) in enumerate(zip(shapes, sides, strict=True)) if own}

@@ -104,7 +104,7 @@ def found_relations(wireframe: Wireframe, matching: "EdgelMatching") -> tuple[Co
     imposed = []
     judge = Judge.of(wireframe, matching)
     for kind in KINDS:
-        candidates = [(relation, judge.linear(relation)) for relation in CANDIDATES[kind](wireframe, matching.pixel)]
+        candidates = [(relation, judge.linear(relation)) for relation in RELATIONS[kind](wireframe, matching.pixel)]
         for relation, linear in sorted(candidates, key=lambda pair: judge.rise(pair[1])):
             if judge.rise(linear) <= judge.allowed:
                 counts[kind] += 1
@@ -333,7 +333,7 @@ def _off_plane(sides: np.ndarray | None, *span: np.ndarray) -> np.ndarray:
     return np.array([*turn, normal @ (last[PLACE] - place)])
 
 
-CANDIDATES = {
+RELATIONS = {
     "parallel": _parallel,
     "perpendicular": _perpendicular,
     "equal_radius": _equal_radius,

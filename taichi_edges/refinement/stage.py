@@ -25,7 +25,7 @@ from taichi_edges.refinement.adjustment import adjusted
 from taichi_edges.refinement.anchoring import anchored_lines
 from taichi_edges.refinement.completion import completed
 from taichi_edges.refinement.continuation import continued
-from taichi_edges.refinement.extents import all_extended
+from taichi_edges.refinement.extents import extended
 from taichi_edges.refinement.junctions import connected
 from taichi_edges.refinement.regularities import found_relations, regularised
 
@@ -37,7 +37,7 @@ NOISE_PX = 0.2  # by which an edge is off its shape, beyond the noise: next to o
 LEAST_LENGTH_PX = 0.1  # of a stroke; a shorter one has no direction
 WIDE_GAP_PX = 24.0  # between strokes that continue each other, where their ends are still free after the first pass
 MOST_COMPARED = 150  # edges whose relations are counted where nobody asked for them: there are as many as its square
-LEAST_CONFIDENCE = 0.2  # of an edge, see `evidence.evidence_of`
+LEAST_CONFIDENCE = 0.2  # of an edge, see `edge_support.evidence_of`
 LENIENT = 0.75  # of the steadiness, for edges that have not been adjusted
 LEAST_SUPPORTED = 0.33  # of the length of an edge; where edges touch, only one of them owns the edgels
 
@@ -150,4 +150,4 @@ def with_longer_ends(matching: EdgelMatching, shapes: Sequence[Shape]) -> list[S
     def seen(numbers: list[int], places: list[tuple[Shape, np.ndarray]]) -> list[np.ndarray]:
         return support_of_places(matching, places, claims, numbers)
 
-    return all_extended(shapes, free, seen, matching.pixel)
+    return extended(shapes, free, seen, matching.pixel)

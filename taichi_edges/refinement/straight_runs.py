@@ -24,7 +24,7 @@ LEAST_EDGELS = 5  # of a part of one
 
 
 @dataclass(frozen=True)
-class Runs(Columns):
+class StraightRuns(Columns):
     """Straight runs of edgels. views: (n,). ends: (n, 2, 2) px."""
 
     views: np.ndarray
@@ -41,8 +41,8 @@ class Runs(Columns):
         return (self.ends[:, 1] - self.ends[:, 0]) / np.maximum(self.lengths, 1e-300)[:, None]
 
 
-def runs_of(edgels: "Edgels", free: np.ndarray) -> Runs:
-    """The Runs of those Edgels that are free, (e,) bool."""
+def runs_of(edgels: "Edgels", free: np.ndarray) -> StraightRuns:
+    """The StraightRuns of those Edgels that are free, (e,) bool."""
     views, ends = [np.zeros(0, np.int64)], [np.zeros((0, 2, 2))]
     for view in range(edgels.view_count):
         mine = free[edgels.starts[view] : edgels.starts[view + 1]]
@@ -50,7 +50,7 @@ def runs_of(edgels: "Edgels", free: np.ndarray) -> Runs:
         found = straight_runs(points[mine].astype(np.float64), normals[mine].astype(np.float64))
         views.append(np.full(len(found), view))
         ends.append(found)
-    return Runs(np.concatenate(views), np.concatenate(ends))
+    return StraightRuns(np.concatenate(views), np.concatenate(ends))
 
 
 def straight_runs(points: np.ndarray, normals: np.ndarray) -> np.ndarray:

@@ -8,8 +8,6 @@ import taichi as ti
 
 from taichi_edges.arrays.columns import Columns
 
-SCALE_INIT = 0.004  # unit-cube units; supplement, "Gaussian Scale"
-OPACITY_INIT = 0.08  # supplement, "Gaussian Opacity"
 MIN_CAPACITY = 4096  # a changed capacity recompiles every kernel, so capacities are powers of two from here up
 
 
@@ -58,12 +56,10 @@ def logit(opacity: float) -> float:
     return np.log(opacity / (1.0 - opacity))
 
 
-def start_gaussians(
-    points: np.ndarray, generator: np.random.Generator, scale: float = SCALE_INIT, opacity: float = OPACITY_INIT
-) -> Gaussians:
+def start_gaussians(points: np.ndarray, generator: np.random.Generator, scale: float, opacity: float) -> Gaussians:
     """Gaussians at given points, as the supplement starts them: constant scale and opacity, random unit quaternions.
 
-    points: (n, 3) unit-cube units. generator: numpy.random.Generator.
+    points: (n, 3) unit-cube units. generator: numpy.random.Generator. scale: unit-cube units. opacity: 0..1.
     """
     count = len(points)
     quaternions = generator.normal(size=(count, 4))

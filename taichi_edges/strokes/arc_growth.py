@@ -11,8 +11,11 @@ from taichi_edges.arrays.columns import Columns
 from taichi_edges.arrays.ranges import ragged
 from taichi_edges.fitting.arc_batch import ArcBatch, fit_batch
 from taichi_edges.fitting.arcs import Arc
+from taichi_edges.fitting.prices import OUTLIER
 
-INLIER = 3.0  # noises: a point on an edge lies no farther from it (99 % of those of a normal distribution in a plane)
+INLIER = (
+    OUTLIER**0.5
+)  # noises: a point on an edge lies no farther from it (99 % of those of a normal distribution in a plane)
 SAGITTA = 3.0  # noises that the middle of an arc is off its chord, at least; a line follows a flatter one as well
 START_POINTS = 5  # aligned neighbours that a seed starts with, at least, itself included
 GROWTH = 0.5  # of an arc's length: how far beyond its ends it is looked for; a longer arc foretells more

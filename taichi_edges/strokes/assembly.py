@@ -42,15 +42,15 @@ def assemble(points: np.ndarray, directions: np.ndarray, config: "ClusterConfig"
     neighbors = [row[good] for row, good in zip(graph.indices, follows, strict=True)]
     most = min(MOST_NOISE, MOST_NOISE_PX * pixel)
     cloud = Cloud(points, directions, measured_scale(points, directions, neighbors, seeds, config.max_gap, most))
-    found, ledger = claims(cloud, neighbors, seeds, config.min_points)
-    pieces = merged(cloud, found, ledger.noise)
+    found, taken = claims(cloud, neighbors, seeds, config.min_points)
+    pieces = merged(cloud, found, taken.noise)
     free, replaced = free_curves(cloud, pieces, config)
     pieces = [piece for number, piece in enumerate(pieces) if number not in replaced]
     labels, shared = np.full(len(points), UNASSIGNED), [np.zeros((0, 2), int)]
     for number, piece in enumerate(pieces):
         labels[piece.own] = number
         shared.append(np.stack([piece.shared, np.full(len(piece.shared), number)], axis=1))
-    left = left_over(cloud, graph, ledger.owner, config)
+    left = left_over(cloud, graph, taken.owner, config)
     labels, traversed = np.where(left >= 0, left + len(pieces), labels), int(left.max()) + 1
     for number, members in enumerate(free, start=len(pieces) + traversed):
         labels[members] = number
@@ -98,7 +98,7 @@ def sharers(shared: np.ndarray, count: int) -> list[np.ndarray]:
 
 
 def fit_edge(points: np.ndarray, arc: Arc | None, config: "FitConfig") -> ClusterFit:
-    """The Fit of one edge: its line or arc as it is, if the paper's ratio of errors keeps the arc, or `fit_cluster`."""
+    """The ClusterFit of one edge: its line or arc as it is, if the paper's ratio keeps that, or `fit_cluster`."""
     if arc is None:
         return fit_cluster(points, config)
     if arc.length < config.min_length:

@@ -6,9 +6,10 @@ again.
 """
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from taichi_edges.arrays.components import components_of
 from taichi_edges.strokes.neighbors import UNASSIGNED, members_of_clusters
 from taichi_edges.strokes.ordering import connected_graph, extremity, two_sides
 
@@ -56,7 +57,7 @@ def longest_walk(points: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     distances = cKDTree(samples).query(points)[0]
     on_walk = distances <= max(BESIDE * scatter(points), LEAST_BESIDE)
     rest = np.flatnonzero(~on_walk)
-    _, groups = connected_components(graph[rest][:, rest], directed=False)
+    groups = components_of(graph[rest][:, rest])
     return on_walk, [rest[members] for members in members_of_clusters(groups)]
 
 

@@ -15,10 +15,9 @@ import numpy as np
 
 from taichi_edges.fitting.arc_batch import ArcBatch
 from taichi_edges.fitting.arcs import Arc, fit_arc
-from taichi_edges.fitting.prices import price_of_arc
+from taichi_edges.fitting.prices import OUTLIER, price_of_arc
 from taichi_edges.strokes.arc_growth import INLIER, Cloud, Inliers, grown_from_seeds, unbroken
 
-OUTLIER = INLIER**2  # squared noises: what a point on an edge brings at most
 OWN_SHARE = 0.5  # of the points along a stretch, which must be an arc's own: elsewhere it repeats another
 LEAST_DENSITY = 4.0  # own points on the length of a gap, on average; strays line up by chance, but not so closely
 ROUNDS, COARSER = 3, 2.0  # of claiming, and from the noise of one to that of the next
@@ -51,7 +50,7 @@ class Claim:
         return np.concatenate([self.own, self.shared])
 
 
-class Ledger:
+class PointOwners:
     """Who owns each point, (n,) ints, -1 for nobody; and the noise at which it was claimed, (n,) unit-cube units."""
 
     def __init__(self, count: int) -> None:
@@ -64,24 +63,24 @@ class Ledger:
 
 def claims(
     cloud: Cloud, neighbors: Sequence[np.ndarray], seeds: np.ndarray, min_points: int
-) -> tuple[list[Claim], Ledger]:
-    """Claims of lines and arcs that own disjoint points; and the Ledger that says so.
+) -> tuple[list[Claim], PointOwners]:
+    """Claims of lines and arcs that own disjoint points; and the PointOwners that says so.
 
     neighbors: for every point its aligned neighbours, an index array. seeds: (n,) indices, best first.
     Edges that few views see are noisier than others. Their turn comes when the sharp ones have their points: in every
     round the tolerance is COARSER times that of the round before, and what is found already grows first.
     """
     found: list[Claim] = []
-    ledger, finest = Ledger(len(cloud.points)), cloud.scale.noise
+    taken, finest = PointOwners(len(cloud.points)), cloud.scale.noise
     for number in range(ROUNDS):
         noise = finest * COARSER**number
         if number and noise > MOST_NOISE:
             break
         cloud = cloud.at_scale(replace(cloud.scale, noise=noise, spread=COARSER**number))
-        found = [widened(cloud, claim, ledger, k, beyond=0.0) for k, claim in enumerate(found)]
-        claim_round(cloud, neighbors, seeds[ledger.owner[seeds] < 0], min_points, ledger, found)
-        found = [widened(cloud, claim, ledger, k, beyond=TAIL * cloud.scale.gap) for k, claim in enumerate(found)]
-    return [refined(cloud, claim, ledger) for claim in found], ledger
+        found = [widened(cloud, claim, taken, k, beyond=0.0) for k, claim in enumerate(found)]
+        claim_round(cloud, neighbors, seeds[taken.owner[seeds] < 0], min_points, taken, found)
+        found = [widened(cloud, claim, taken, k, beyond=TAIL * cloud.scale.gap) for k, claim in enumerate(found)]
+    return [refined(cloud, claim, taken) for claim in found], taken
 
 
 def claim_round(
@@ -89,12 +88,12 @@ def claim_round(
     neighbors: Sequence[np.ndarray],
     seeds: np.ndarray,
     min_points: int,
-    ledger: Ledger,
+    taken: PointOwners,
     found: list[Claim],
 ) -> None:
-    """Add to the Claims in `found`, and to the Ledger, what can be claimed at the cloud's scale."""
+    """Add to the Claims in `found`, and to the PointOwners, what can be claimed at the cloud's scale."""
     waiting: list[tuple[float, int, Grown]] = []
-    owner = ledger.owner
+    owner = taken.owner
     for number, (gain, candidate) in enumerate(arc_candidates(cloud, neighbors, seeds, min_points, owner)):
         heapq.heappush(waiting, (-gain, number, candidate))
     while waiting:
@@ -105,19 +104,19 @@ def claim_round(
         if waiting and gain < -waiting[0][0]:  # others have claimed its points: let it wait for its new turn
             heapq.heappush(waiting, (-gain, number, candidate))
             continue
-        ledger.enter(claim.own, len(found), cloud.scale.noise)
+        taken.enter(claim.own, len(found), cloud.scale.noise)
         found.append(claim)
 
 
-def widened(cloud: Cloud, claim: Claim, ledger: Ledger, number: int, beyond: float) -> Claim:
-    """The Claim with the points that nobody owns and that lie on it at the cloud's scale; the Ledger is told.
+def widened(cloud: Cloud, claim: Claim, taken: PointOwners, number: int, beyond: float) -> Claim:
+    """The Claim with the points that nobody owns and that lie on it at the cloud's scale; the PointOwners is told.
 
     beyond: how far it may go on past its ends, without a longer step, unit-cube units.
     """
     arc = claim.arc
     reach = 0.0 if arc.closed else cloud.scale.gap * (beyond > 0)
     on = cloud.inliers(arc, arc.low - reach, arc.high + reach)
-    on = on.keep(ledger.owner[on.members] < 0)
+    on = on.keep(taken.owner[on.members] < 0)
     members, along = on.members, on.along
     if beyond and not arc.closed and len(members):
         stations = np.concatenate([along, np.linspace(arc.low, arc.high, int(arc.length / beyond) + 2)])
@@ -125,14 +124,14 @@ def widened(cloud: Cloud, claim: Claim, ledger: Ledger, number: int, beyond: flo
         members, along = members[good], along[good]
     if not len(members):
         return claim
-    ledger.enter(members, number, cloud.scale.noise)
+    taken.enter(members, number, cloud.scale.noise)
     ends = (arc.low, arc.high) if arc.closed else (min(arc.low, along.min()), max(arc.high, along.max()))
     return Claim(arc.over(*ends), np.union1d(claim.own, members), np.setdiff1d(claim.shared, members))
 
 
-def refined(cloud: Cloud, claim: Claim, ledger: Ledger) -> Claim:
+def refined(cloud: Cloud, claim: Claim, taken: PointOwners) -> Claim:
     """The Claim with its arc fitted once more to all of its points, each as sharply as it was claimed."""
-    members, noises = claim.members, ledger.noise[claim.members]
+    members, noises = claim.members, taken.noise[claim.members]
     places, directions = cloud.points[members], cloud.directions[members]
     shares, tolerance = (noises.min() / noises) ** 2, INLIER * noises.max()
     arc = claim.arc.recentred()

@@ -36,7 +36,7 @@ class ClusterFit:
 
 
 def wireframe_of(fits: Iterable[ClusterFit]) -> tuple[Wireframe, dict[str, int]]:
-    """The loose Wireframe of some Fits, and the dict kind -> how many there are."""
+    """The loose Wireframe of some ClusterFits, and the dict kind -> how many there are."""
     fits = list(fits)
     counts = dict.fromkeys(("line", "curve", "loop", "short", "degenerate"), 0) | Counter(fit.kind for fit in fits)
     return Wireframe.loose([fit.shape for fit in fits if fit.shape is not None]), counts

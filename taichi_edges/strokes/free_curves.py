@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taichi_edges.fitting.cubic_chains import fewest_cubics, fit_chain, nearest_on_chain
-from taichi_edges.fitting.prices import CUBIC_PRICE, NEXT_CUBIC_PRICE, price_of_arc
+from taichi_edges.fitting.prices import OUTLIER, price_of_arc, price_of_cubics
 from taichi_edges.strokes.arc_growth import INLIER, Cloud
 from taichi_edges.strokes.branches import separate_branches
-from taichi_edges.strokes.claiming import OUTLIER
 from taichi_edges.strokes.cluster_fits import POINTS_PER_PIECE
 from taichi_edges.strokes.clustering import grow_clusters
 from taichi_edges.strokes.neighbors import members_of_clusters
@@ -61,14 +60,14 @@ def cost_of_pieces(cloud: Cloud, pieces: "Sequence[Piece]", members: np.ndarray)
             distances, _ = nearest_on_chain(cloud.points[members], piece.chain)
         mine = np.isin(members, piece.members)
         best[mine] = np.minimum(best[mine], (distances[mine] / cloud.scale.noise) ** 2)
-    return best.sum() + sum(price_of(piece) for piece in pieces) * np.log(len(members))
+    return best.sum() + sum(price_of_piece(piece) for piece in pieces) * np.log(len(members))
 
 
-def price_of(piece: "Piece") -> int:
+def price_of_piece(piece: "Piece") -> int:
     """Number of free parameters of a Piece."""
     if piece.arc is not None:
         return price_of_arc(piece.arc)
-    return CUBIC_PRICE + NEXT_CUBIC_PRICE * (len(piece.chain) - 1)
+    return price_of_cubics(len(piece.chain))
 
 
 def cost_of_chain(cloud: Cloud, members: np.ndarray, worth: float) -> float:
@@ -77,7 +76,7 @@ def cost_of_chain(cloud: Cloud, members: np.ndarray, worth: float) -> float:
     ordering = order_points(points)
     first = fewest_cubics(points, ordering)
     for cubics in sorted({first, first + 1, first + 2, 2 * first, 3 * first}):
-        price_of_all = (CUBIC_PRICE + NEXT_CUBIC_PRICE * (cubics - 1)) * np.log(len(members))
+        price_of_all = price_of_cubics(cubics) * np.log(len(members))
         if POINTS_PER_PIECE * cubics > len(points) or price_of_all >= min(worth, best):
             break
         curves, _ = fit_chain(points, ordering, INLIER * cloud.scale.noise, cubics)

@@ -14,9 +14,9 @@ import numpy as np
 
 from taichi_edges.fitting.arcs import Arc, fit_arc
 from taichi_edges.fitting.cubic_chains import Ordering, fit_chain, nearest_on_chain
-from taichi_edges.fitting.prices import CUBIC_PRICE, MOST_CUBICS, NEXT_CUBIC_PRICE, price_of_arc
+from taichi_edges.fitting.prices import MOST_CUBICS, OUTLIER, price_of_arc, price_of_cubics
 from taichi_edges.strokes.arc_growth import INLIER, SAGITTA, Cloud, sagitta
-from taichi_edges.strokes.claiming import OUTLIER, Claim
+from taichi_edges.strokes.claiming import Claim
 
 WIDE = 4.0  # times the tolerance: the first fit to two pieces starts from one of them, and looks farther
 
@@ -80,7 +80,7 @@ class Piece:
 
 
 @dataclass(frozen=True)
-class End:
+class PieceEnd:
     """One end of a Piece, side 0 or 1."""
 
     piece: Piece
@@ -105,8 +105,8 @@ def merged(cloud: Cloud, claims: Sequence[Claim], noises: np.ndarray) -> list[Pi
     def propose(some: Sequence[int]) -> None:
         for number in some:
             ends.add(number, pieces[number])
-        for a, b in piece_joints(cloud, pieces, ends, some):
-            gain, piece = joined(cloud, End(pieces[a[0]], a[1]), End(pieces[b[0]], b[1]))
+        for a, b in facing_ends(cloud, pieces, ends, some):
+            gain, piece = joined(cloud, PieceEnd(pieces[a[0]], a[1]), PieceEnd(pieces[b[0]], b[1]))
             if piece is not None:
                 heapq.heappush(waiting, (-gain, a[0], b[0], next(turns), piece))
 
@@ -162,7 +162,7 @@ class EndGrid:
         return tuple(np.floor(place / self.reach).astype(int).tolist())
 
 
-def piece_joints(
+def facing_ends(
     cloud: Cloud, pieces: Mapping[int, Piece], grid: EndGrid, some: Iterable[int]
 ) -> list[tuple[NumberedEnd, NumberedEnd]]:
     """Pairs of ends that are near and look at each other, each (number of the piece, 0 or 1); one of them in `some`.
@@ -178,7 +178,7 @@ def piece_joints(
     return sorted(found)
 
 
-def joined(cloud: Cloud, end: End, other: End) -> tuple[float, Piece | None]:
+def joined(cloud: Cloud, end: PieceEnd, other: PieceEnd) -> tuple[float, Piece | None]:
     """What it gains to make the pieces of two Ends one, and that Piece; 0 and None where it does not pay."""
     a, b = end.piece, other.piece
     own = np.union1d(a.own, b.own)
@@ -211,7 +211,7 @@ def arc_piece(cloud: Cloud, start: Arc, own: np.ndarray, shared: np.ndarray, str
     return piece_of(cloud, arc.recentred(), own, shared)
 
 
-def free_piece(cloud: Cloud, end: End, other: End, own: np.ndarray, shared: np.ndarray) -> Piece | None:
+def free_piece(cloud: Cloud, end: PieceEnd, other: PieceEnd, own: np.ndarray, shared: np.ndarray) -> Piece | None:
     """The points of two pieces as a smooth chain of as few cubics as pay; see `joined`."""
     members = np.concatenate([own, shared])
     points, noises = cloud.points[members], cloud.noises[members]
@@ -222,14 +222,14 @@ def free_piece(cloud: Cloud, end: End, other: End, own: np.ndarray, shared: np.n
             break
         curves, _ = fit_chain(points, ordering, INLIER * noises.max(), cubics)
         distances, along = nearest_on_chain(points, curves)
-        cost = (CUBIC_PRICE + NEXT_CUBIC_PRICE * (cubics - 1)) * np.log(len(points)) + capped(distances**2, noises)
+        cost = price_of_cubics(cubics) * np.log(len(points)) + capped(distances**2, noises)
         if best is None or cost < best.cost:
             best = Piece(None, curves, own, shared, along, cost)
     return best
 
 
-def chained(end: End, other: End, members: np.ndarray) -> Ordering:
-    """Ordering of the members of two pieces: along the one to its End, on from the other End along the other."""
+def chained(end: PieceEnd, other: PieceEnd, members: np.ndarray) -> Ordering:
+    """Ordering of the members of two pieces: along the one to its end, on from the end of the other along that."""
     (places, outwards), (other_places, _) = end.piece.ends(), other.piece.ends()
     gap = (other_places[other.side] - places[end.side]) @ outwards[end.side]
     order = np.argsort(members, kind="stable")

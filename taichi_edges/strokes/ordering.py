@@ -2,9 +2,10 @@
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra, minimum_spanning_tree
+from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
+from taichi_edges.arrays.components import components_of
 from taichi_edges.fitting.cubic_chains import Ordering
 from taichi_edges.strokes.neighbors import members_of_clusters
 
@@ -40,8 +41,8 @@ def connected_graph(points: np.ndarray) -> csr_array:
     lengths = np.maximum(lengths, 1e-12)  # a sparse graph takes a zero for a missing edge
     full = coo_array((lengths, (rows, columns)), shape=(len(points),) * 2).tocsr()
     full = full.maximum(full.T)
-    pieces, labels = connected_components(full, directed=False)
-    if pieces > 1:
+    labels = components_of(full)
+    if labels.any():
         full = join_pieces(points, full, labels)
     tree = minimum_spanning_tree(full)
     if tree.nnz:
@@ -77,14 +78,14 @@ def two_sides(graph: csr_array, from_start: np.ndarray) -> list[np.ndarray] | No
     """
     length = from_start.max()
     waist = np.flatnonzero((from_start >= WAIST[0] * length) & (from_start <= WAIST[1] * length))
-    _, labels = connected_components(graph[waist][:, waist], directed=False)
+    labels = components_of(graph[waist][:, waist])
     strips = [waist[members] for members in members_of_clusters(labels)]
     least = SPAN * (WAIST[1] - WAIST[0]) * length
     strips = [strip for strip in strips if np.ptp(from_start[strip]) >= least]
     if len(strips) != 2:
         return None
     beyond = np.flatnonzero(from_start >= WAIST[0] * length)
-    _, sides = connected_components(graph[beyond][:, beyond], directed=False)
+    sides = components_of(graph[beyond][:, beyond])
     meeting = np.isin(beyond, strips[0]), np.isin(beyond, strips[1])
     return strips if set(sides[meeting[0]]) & set(sides[meeting[1]]) else None
 

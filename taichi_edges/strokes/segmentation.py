@@ -8,13 +8,12 @@ straight and curved stretches; the cluster is cut at both ends of every straight
 import numpy as np
 
 from taichi_edges.arrays.ranges import ragged
+from taichi_edges.fitting.prices import ARC_PRICE, LINE_PRICE, OUTLIER
 from taichi_edges.strokes.neighbors import UNASSIGNED, members_of_clusters
 from taichi_edges.strokes.ordering import order_points
 
 STATIONS = 32  # places along a cluster at which it may be cut
 MIN_STRETCH = 5  # points; a line through fewer says nothing
-LINE_PRICE, CURVE_PRICE = 5, 8  # free parameters: a line and where it ends; a circular arc and where it starts and ends
-OUTLIER = 9.0  # squared residuals in units of the noise count up to here
 NOISE_WINDOW = 10  # points on which a quadratic measures the local scatter
 MIN_NOISE = 7e-4  # unit-cube units; detectors' errors vary slowly along an edge, so the scatter alone is too small
 BLOCK = 1 << 13  # points of overlapping stretches that are looked at in one go; the intermediate arrays stay in cache
@@ -67,7 +66,7 @@ def cut_chain(chain: np.ndarray) -> tuple[list[int], list[bool]]:
     stations = np.unique(np.linspace(0, count, min(STATIONS, count // MIN_STRETCH) + 1).round().astype(int))
     ends, starts = np.tril_indices(len(stations), -1)  # a stretch runs from any station to any later one
     costs = np.stack(stretch_costs(chain, stations[starts], stations[ends], noise), axis=1)
-    costs += np.array([LINE_PRICE, CURVE_PRICE]) * np.log(count)
+    costs += np.array([LINE_PRICE, ARC_PRICE]) * np.log(count)  # a cubic stands for an arc
     best = np.zeros(len(stations))
     came_from, was_curved = np.zeros(len(stations), int), np.zeros(len(stations), bool)
     for end in range(1, len(stations)):

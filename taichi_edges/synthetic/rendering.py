@@ -8,7 +8,7 @@ import numpy as np
 
 from taichi_edges.synthetic.drawing import Imperfections, draw_edge_map
 from taichi_edges.synthetic.visibility import ray_scene, sample_contours, sample_edges, visible_from
-from taichi_edges.views.cameras import project
+from taichi_edges.views.cameras import camera_centre, project
 from taichi_edges.views.light import light_of_srgb, srgb_of_light
 from taichi_edges.views.views import Views
 
@@ -65,11 +65,6 @@ def look_at(centre: np.ndarray, target: np.ndarray) -> np.ndarray:
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     return np.column_stack([rotation, -rotation @ centre])
-
-
-def camera_centre(world_to_camera: np.ndarray) -> np.ndarray:
-    """(3,) position of a camera in the world."""
-    return -world_to_camera[:, :3].T @ world_to_camera[:, 3]
 
 
 def pixel_size(intrinsics: np.ndarray, world_to_camera: np.ndarray) -> float:

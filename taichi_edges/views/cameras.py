@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-# Near planes, all there are, in unit-cube units.
+# Near planes, in unit-cube units. `splatting/visibility.py` alone has another: what is in front at all hides nothing.
 NEAR = 0.01  # what is nearer counts as behind the camera
 SWEPT_FROM = 2 * NEAR  # a sweep's steps are even in inverse depth: half of them would lie nearer than this
 DRAWN_FROM = 5 * NEAR  # a nearer Gaussian would fill the image: it is not drawn, and its camera does not vote
@@ -73,13 +73,12 @@ class Camera:
     @property
     def centre(self) -> np.ndarray:
         """(3,) where it stands."""
-        return -self.world_to_camera[:, :3].T @ self.world_to_camera[:, 3]
+        return camera_centre(self.world_to_camera)
 
     @property
     def planes(self) -> np.ndarray:
         """(5, 4): the homogeneous images (u d, v d, d, 1) that are in sight have no negative product with any."""
-        right, below = self.width - 0.5, self.height - 0.5
-        return np.array([[0, 0, 1, -NEAR], [1, 0, 0.5, 0], [-1, 0, right, 0], [0, 1, 0.5, 0], [0, -1, below, 0]])
+        return frustum_planes(self.width, self.height)
 
     def homogeneous(self, points: np.ndarray) -> np.ndarray:
         """(n, 4): u d, v d, d and 1 of (n, 3) points at depth d."""
@@ -126,6 +125,32 @@ class Cameras:
         homogeneous = np.einsum("nij,nj->ni", matrices[:, :, :3], points) + matrices[:, :, 3]
         depths = homogeneous[:, 2]
         return homogeneous[:, :2] / np.where(depths > NEAR, depths, np.nan)[:, None], depths
+
+
+def camera_centre(world_to_camera: np.ndarray) -> np.ndarray:
+    """(3,) where a camera of (3, 4) world_to_camera stands."""
+    return -world_to_camera[:, :3].T @ world_to_camera[:, 3]
+
+
+def frustum_planes(width: int, height: int, margin: float = 0.5) -> np.ndarray:
+    """(5, 4) planes: what an image shows has no negative product (u d, v d, d, 1) with any, d being the depth.
+
+    Near, left, right, top, bottom. margin: pixels beyond the centres of the outermost ones that still count.
+    """
+    right, below = width - 1 + margin, height - 1 + margin
+    return np.array([[0, 0, 1, -NEAR], [1, 0, margin, 0], [-1, 0, right, 0], [0, 1, margin, 0], [0, -1, below, 0]])
+
+
+def shares_inside(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(c,) shares between which segments are on the right side of all planes; where low >= high they nowhere are.
+
+    begin, end: (p, c) signed distances of their ends from the planes.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = begin / (begin - end)
+    low = np.where((begin < 0) & (end >= 0), crossing, np.where(begin < 0, 1.0, 0.0)).max(axis=0)
+    high = np.where((end < 0) & (begin >= 0), crossing, np.where(end < 0, 0.0, 1.0)).min(axis=0)
+    return low, high
 
 
 def inside_image(pixels: np.ndarray, width: int, height: int) -> np.ndarray:

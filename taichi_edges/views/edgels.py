@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+MOST_SINE = 0.35  # of the angle between an edgel and a direction: 20 degrees, as a bend or noise may turn it
+
 
 @dataclass(frozen=True)
 class Edgels:

@@ -1,4 +1,4 @@
-"""The colours of everything we export. RGB, uint8."""
+"""The colours of everything that is written to be looked at. RGB, uint8."""
 
 import numpy as np
 

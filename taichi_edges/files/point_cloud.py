@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from taichi_edges.errors import UserError
-from taichi_edges.exporters.palette import label_colours
 from taichi_edges.files.artefacts import replacing
+from taichi_edges.files.palette import label_colours
 from taichi_edges.files.ply import read_vertices, stack_fields
 
 POINT_FIELDS = ("x", "y", "z")
