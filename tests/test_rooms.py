@@ -1,4 +1,4 @@
-"""The order of the rooms: a room imports only rooms that stand below it in the picture of docs/design.md; no circles."""
+"""The order of the rooms: a room imports only rooms below it in the picture of docs/design.md; no circles."""
 
 import ast
 import re

@@ -237,7 +237,6 @@ def test_render_views_gives_views_and_pictures(parts, taichi):
     assert (pictures[:, 0, 0] == 255).all() and (pictures[:, 60, 60] < 250).all()
     on_edges = sample_edges(parts["demo"], 0.02).points
     assert all(inside_image(views.project(on_edges, view)[0], 120, 120).all() for view in range(4))
-    start_taichi("f32", 2)
     strength = PixelOwners(views, on_edges.astype(np.float32), 0.5).strength
     assert (strength > 0.5 / 4).mean() > 0.9  # an edge pixel in one view of four, at least
 
