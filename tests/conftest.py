@@ -5,14 +5,12 @@ import os
 import subprocess
 import sys
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 import taichi as ti
 
-from taichi_edges.corridor.pipeline import Run
-from taichi_edges.kernels.device import is_running
+from taichi_edges.kernels.device import is_running, kernel_cache
 from taichi_edges.splatting.splatter import Splatter
 from taichi_edges.synthetic.drawing import Imperfections
 from taichi_edges.synthetic.parts import PARTS
@@ -94,7 +92,7 @@ def start_taichi():
 
     A test that wants a GPU is skipped where there is none: ti.init would fall back to the CPU.
     """
-    kernels = Run(None, Path()).kernel_cache
+    kernels = kernel_cache()
 
     def start(real, threads, arch="cpu"):
         if arch != "cpu" and not offers(arch):

@@ -8,9 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from taichi_edges.corridor.pipeline import Run
-from taichi_edges.kernels.device import STALE_LOCK, download, is_running, release_cache, upload
-from taichi_edges.scene.settings import SceneConfig
+from taichi_edges.kernels.device import STALE_LOCK, download, is_running, kernel_cache, release_cache, upload
 
 
 @pytest.mark.parametrize("age, stays", [(0.5 * STALE_LOCK, True), (2 * STALE_LOCK, False)])
@@ -42,10 +40,9 @@ def test_a_cache_that_is_not_there_yet_needs_nothing(tmp_path):
 
 def test_each_pair_of_versions_has_a_cache_of_its_own(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    config = SceneConfig(source={"reader": "synthetic"})
-    folder = Run(config, tmp_path).kernel_cache
-    monkeypatch.setattr("taichi_edges.corridor.pipeline.version", lambda package: "9.9")
-    other = Run(config, tmp_path).kernel_cache
+    folder = kernel_cache()
+    monkeypatch.setattr("taichi_edges.kernels.device.version", lambda package: "9.9")
+    other = kernel_cache()
     assert folder != other and folder.is_relative_to(tmp_path) and "9.9" in other.name
 
 

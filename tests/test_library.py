@@ -152,12 +152,15 @@ def test_what_is_no_scene_and_no_run_is_refused_at_once(elsewhere):
 
 def test_files_inside_the_run_are_called_the_same_on_every_system(monkeypatch):
     folder = PureWindowsPath("C:/runs/demo")
-    assert pipeline._label(SimpleNamespace(folder=folder), folder / "images" / "a.png") == "images/a.png"
-    assert pipeline._label(SimpleNamespace(folder=folder), PureWindowsPath("C:/data/a.png")) == "C:/data/a.png"
+    assert pipeline.file_label(SimpleNamespace(folder=folder), folder / "images" / "a.png") == "images/a.png"
+    assert pipeline.file_label(SimpleNamespace(folder=folder), PureWindowsPath("C:/data/a.png")) == "C:/data/a.png"
     monkeypatch.setattr(prepare, "Path", PureWindowsPath)
     monkeypatch.setattr(prepare, "os", SimpleNamespace(path=ntpath))
-    assert prepare._relative(r"C:\runs\demo\images\a.png", str(folder)) == "images/a.png"
-    assert prepare._relative(r"C:\data\a.png", str(folder)) == r"C:\data\a.png" and prepare._relative("", "C:/") == ""
+    assert prepare.relative_path(r"C:\runs\demo\images\a.png", str(folder)) == "images/a.png"
+    assert (
+        prepare.relative_path(r"C:\data\a.png", str(folder)) == r"C:\data\a.png"
+        and prepare.relative_path("", "C:/") == ""
+    )
 
 
 def test_settings_may_be_sections_or_keys(elsewhere):

@@ -3,6 +3,7 @@
 CONTRIBUTING.md lists these places for a reader, a detector, an exporter and a part.
 """
 
+import re
 from pathlib import Path
 from typing import get_args
 
@@ -43,7 +44,8 @@ def test_presets_name_only_readers_that_there_are():
 
 
 def test_the_command_line_takes_what_the_tables_hold():
-    choices = {action.dest: set(action.choices) for action in make_parser()._actions if action.choices}
+    offered = re.findall(r"--(\w+) \{([\w,]+)\}", " ".join(make_parser().format_usage().split()))
+    choices = {option: set(values.split(",")) for option, values in offered}
     assert choices == {
         "stage": set(STAGES),
         "until": set(STAGES),

@@ -17,7 +17,7 @@ def cluster(run: "Run") -> dict[str, Any]:
     """`gaussians.ply`, `views.npz` -> `points.ply` (filtered oriented points, input frame) and `clusters.npz`."""
     from taichi_edges.files.point_cloud import write_oriented_points
     from taichi_edges.files.splats import read_gaussians
-    from taichi_edges.kernels.device import is_running, start_taichi
+    from taichi_edges.kernels.device import is_running, kernel_cache, start_taichi
     from taichi_edges.points.filtering import FEW_VIEWS, filter_points
     from taichi_edges.splatting.gaussians import Gaussians
     from taichi_edges.strokes.assembly import assemble
@@ -25,7 +25,7 @@ def cluster(run: "Run") -> dict[str, Any]:
     from taichi_edges.strokes.contours import without_contours
 
     if not is_running(run.arch, run.threads):  # after the training it is
-        start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)
+        start_taichi(run.arch, run.threads, run.config.seed, kernel_cache())
     views = read_views(run.path("views.npz"))
     gaussians = Gaussians(*read_gaussians(run.path("gaussians.ply")))
     means = views.similarity.to_unit(gaussians.means.astype(np.float64))

@@ -55,10 +55,10 @@ def finish_views(run: "Run", views: Views, frames: "Frames | None" = None) -> di
 def _chained(run: "Run", views: Views) -> tuple[Views, np.ndarray]:
     """The views with the edgels on long chains, and maps drawn through these; and which of all edgels those are."""
     from taichi_edges.detectors.chains import with_chain_strengths
-    from taichi_edges.kernels.device import start_taichi
+    from taichi_edges.kernels.device import kernel_cache, start_taichi
     from taichi_edges.views.drawing import draw_edge_maps
 
-    start_taichi("cpu", run.threads, run.config.seed, run.kernel_cache)
+    start_taichi("cpu", run.threads, run.config.seed, kernel_cache())
     edgels, lengths = with_chain_strengths(_traced_edgels(views), views.height, views.width)
     kept = lengths >= run.config.source.min_chain
     edgels = edgels.keep(kept)
@@ -137,10 +137,10 @@ def _calibrated(run: "Run", views: Views) -> "tuple[Views, Calibration | None]":
 def _calibrate(run: "Run", views: Views, thin: Views) -> "tuple[Edgels, Calibration]":
     """The edgels without the detector's biases, and the Calibration. thin: the views with maps drawn thin."""
     from taichi_edges.calibration.calibration import calibrate
-    from taichi_edges.kernels.device import start_taichi
+    from taichi_edges.kernels.device import kernel_cache, start_taichi
     from taichi_edges.seeding.voting import vote_seeds
 
-    start_taichi("cpu", run.threads, run.config.seed, run.kernel_cache)  # here as everywhere: prepare is no GPU's work
+    start_taichi("cpu", run.threads, run.config.seed, kernel_cache())  # here as everywhere: prepare is no GPU's work
     generator = np.random.default_rng(run.config.seed)
     seeds = vote_seeds(thin, run.config.train.edge_threshold, generator, CALIBRATION_SEEDS)
     wanted, edgels = run.config.calibration, _traced_edgels(views)

@@ -102,12 +102,6 @@ class Run:
         """An artefact's path."""
         return self.folder / name
 
-    @property
-    def kernel_cache(self) -> Path:
-        """Where compiled Taichi kernels are kept between runs: a folder of our own for each pair of versions."""
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        return home / "taichi_edges" / f"kernels-{taichi_edges.__version__}-taichi-{version('taichi')}"
-
     def data_path(self, text: Path | str, key: str) -> Path:
         """A path of the scene: absolute, or relative to the data root. UserError where it does not exist."""
         path = expand(text, key)
@@ -224,11 +218,11 @@ def _settings(run: Run, stage: Stage) -> dict[str, Any]:
 def _inputs(run: Run, stage: Stage) -> dict[str, Any]:
     """What the stage depends on: its settings, the versions, and the digest of every file it reads."""
     files = {artefact: digest_file(run.path(artefact)) for artefact in stage.reads}
-    files |= {_label(run, path): digest_file(path) for path in stage.outside(run) if path.exists()}
+    files |= {file_label(run, path): digest_file(path) for path in stage.outside(run) if path.exists()}
     return {"settings": _settings(run, stage), "files": files, "versions": package_versions(stage.packages)}
 
 
-def _label(run: Run, path: Path) -> str:
+def file_label(run: Run, path: Path) -> str:
     """A file's path, relative to the run's folder where it lies in it: a folder that was moved is not stale."""
     return (path.relative_to(run.folder) if path.is_relative_to(run.folder) else path).as_posix()
 

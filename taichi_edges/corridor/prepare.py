@@ -117,10 +117,10 @@ def _task(run: "Run", detector: str) -> "DetectionTask":
 
 def _inside_the_run(run: "Run", views: Views) -> Views:
     """The views with paths relative to the run's folder for pictures in it: it may be moved."""
-    return replace(views, image_paths=tuple(_relative(path, str(run.folder)) for path in views.image_paths))
+    return replace(views, image_paths=tuple(relative_path(path, str(run.folder)) for path in views.image_paths))
 
 
-def _relative(path: str, folder: str) -> str:
+def relative_path(path: str, folder: str) -> str:
     """A path as it is seen from a folder that it lies in, with slashes; another as it is, '' for none as well."""
     whole, around = Path(os.path.abspath(path)), Path(os.path.abspath(folder))
     return whole.relative_to(around).as_posix() if path and whole.is_relative_to(around) else path

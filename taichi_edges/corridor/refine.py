@@ -13,14 +13,14 @@ if TYPE_CHECKING:
 
 def refine(run: "Run") -> dict[str, Any]:
     """`edges_fit.json`, `views.npz` -> `edges.json` (input frame): edges that meet, and what the images say of each."""
-    from taichi_edges.kernels.device import is_running, start_taichi
+    from taichi_edges.kernels.device import is_running, kernel_cache, start_taichi
     from taichi_edges.refinement.stage import refine_wireframe
 
     views = read_views(run.path("views.npz"))
     loose, about = wireframe_and_about(run.path("edges_fit.json"))
     loose = loose.transformed(views.similarity.to_unit, views.similarity.scale)
     if run.config.refine.enabled and len(loose) and not is_running(run.arch, run.threads):
-        start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)
+        start_taichi(run.arch, run.threads, run.config.seed, kernel_cache())
     wireframe, counts = refine_wireframe(loose, views, run.config.refine)
     if len(loose) and not len(wireframe):
         found = f"the images support none of the {amount(len(loose), 'edge')} that were fitted"

@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 def train(run: "Run") -> dict[str, Any]:
     """`views.npz` -> `gaussians.ply` (input frame) and `train_log.csv`."""
     from taichi_edges.files.splats import write_gaussians
-    from taichi_edges.kernels.device import start_taichi
+    from taichi_edges.kernels.device import kernel_cache, start_taichi
     from taichi_edges.splatting.training import Training
 
     config, views = run.config.train, read_views(run.path("views.npz"))
     generator = np.random.default_rng(run.config.seed)
-    start_taichi(run.arch, run.threads, run.config.seed, run.kernel_cache)
+    start_taichi(run.arch, run.threads, run.config.seed, kernel_cache())
     start = start_of_training(run, views, generator)
     training = Training(views, config, generator, run.threads, run.arch)
     gaussians, records = training.run(start, run.progress)

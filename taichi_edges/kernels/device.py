@@ -3,17 +3,26 @@
 import contextlib
 import gc
 import io
+import os
 import tempfile
 import time
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import taichi as ti
 
+import taichi_edges
 from taichi_edges.errors import OptionError
 
 DEVICES = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
 STALE_LOCK = 60.0  # seconds; Taichi holds the lock of its kernel cache for some milliseconds
+
+
+def kernel_cache() -> Path:
+    """Where compiled kernels are kept between runs: a folder of our own for each pair of versions."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return home / "taichi_edges" / f"kernels-{taichi_edges.__version__}-taichi-{version('taichi')}"
 
 
 def start_taichi(arch: str, threads: int, seed: int, cache: Path | str) -> None:
