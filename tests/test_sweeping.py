@@ -198,7 +198,7 @@ def test_best_seeds_have_most_companions_and_there_is_room_for_them(generator):
     points = 0.4 + generator.random((count, 3)) * 0.2  # in the images of all views
     companions = generator.integers(0, 20, count)
     along = np.tile([1.0, 0, 0], (count, 1))
-    seeds = SweepSeeds(points, along, np.full(count, 4), companions, np.full(count, pixel), references=300)
+    seeds = SweepSeeds(points, along, np.full(count, 4), np.full(count, pixel), companions, references=300)
     chosen = best_seeds(seeds, views, count)
     cells = np.floor(points / (sweeping.THINNED_PX * pixel)).astype(int)
     assert len(np.unique(cells[chosen], axis=0)) == len(chosen)

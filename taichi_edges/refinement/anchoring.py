@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from taichi_edges.arrays.columns import Columns
-from taichi_edges.arrays.ranges import ragged
+from taichi_edges.arrays.ranges import ragged, starts_of
 from taichi_edges.evidence.edge_support import Support, support_of
 from taichi_edges.evidence.lying import EdgelsAbout
 from taichi_edges.geometry.shapes import Line, Shape
@@ -109,7 +109,7 @@ class Lines(Columns):
 def hypotheses(runs: StraightRuns, anchors: Anchors) -> Lines:
     """The Lines through pairs of anchors of StraightRuns with which most others agree, at most TRIED for each run."""
     counts = np.bincount(anchors.runs, minlength=len(runs))
-    starts = np.cumsum(counts) - counts
+    starts = starts_of(counts)
     several: list[Lines] = []
     for count in range(2, MOST_ANCHORS + 1):
         chosen = np.flatnonzero(counts == count if count < MOST_ANCHORS else counts >= count)

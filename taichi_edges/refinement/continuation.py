@@ -8,6 +8,7 @@ over all ways to cut it. A stroke that lies beside others on its whole length re
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, replace
 from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -59,6 +60,24 @@ class Stroke:
 
     shape: Shape
     track: Track
+
+
+class SmoothPath(NamedTuple):
+    """Strokes that continue each other: (number, reversed) of each, and whether they come back to their start."""
+
+    strokes: list[tuple[int, bool]]
+    closes: bool
+
+
+class Cut(NamedTuple):
+    """The cheapest way to describe a path as far as one of its strokes.
+
+    cost: BIC of the path so far. first: number in the path of the first stroke of the last shape. shape: that shape.
+    """
+
+    cost: float
+    first: int
+    shape: Shape
 
 
 def continued(
@@ -215,15 +234,10 @@ def closed_shape(strokes: Sequence[Stroke], yardstick: Yardstick, seen: Seen) ->
     return shape if shape is not None and replaces(shape, strokes, yardstick, seen) else None
 
 
-def smooth_paths(
-    shapes: Sequence[Shape], yardstick: Yardstick, gap_px: float
-) -> list[tuple[list[tuple[int, bool]], bool]]:
-    """Lists of (index, reversed) of strokes that continue each other, and whether they come back to their start.
-
-    Every shape is in one of them.
-    """
+def smooth_paths(shapes: Sequence[Shape], yardstick: Yardstick, gap_px: float) -> list[SmoothPath]:
+    """The SmoothPaths of shapes; every shape is in one of them."""
     partner = partners_of_ends(shapes, yardstick, gap_px)
-    paths: list[tuple[list[tuple[int, bool]], bool]] = []
+    paths: list[SmoothPath] = []
     seen: set[int] = set()
     ends = [(number, side) for number, shape in enumerate(shapes) for side in (0, 1)]
     starts = [end for end in ends if end not in partner] + ends  # open paths first, then what goes round
@@ -237,7 +251,7 @@ def smooth_paths(
             seen.add(number)
             path.append((number, side == 1))
             onward = partner.get((number, 1 - side))
-        paths.append((path, onward == start))
+        paths.append(SmoothPath(path, onward == start))
     return paths
 
 
@@ -273,23 +287,22 @@ def cut_anew(strokes: Sequence[Stroke], yardstick: Yardstick, seen: Seen) -> lis
     strokes: in the order of the path, their Tracks in its direction.
     """
     count = observations(np.concatenate([stroke.track.share for stroke in strokes]), yardstick)
-    least, choice = [0.0], []
+    least, cuts = [0.0], []
     for last, stroke in enumerate(strokes):
-        best = (least[last] + price_of(stroke.shape) * np.log(count), last, stroke.shape)
+        best = Cut(least[last] + price_of(stroke.shape) * np.log(count), last, stroke.shape)
         for first in range(last - 1, max(0, last - LONGEST_RUN + 1) - 1, -1):
             run = strokes[first : last + 1]
-            worth = (best[0] - least[first]) * (1 - ROUNDING)
+            worth = (best.cost - least[first]) * (1 - ROUNDING)
             shape, cost = best_shape(joined_track(run), yardstick, count, worth)
             if shape is not None and replaces(shape, run, yardstick, seen):
-                best = (least[first] + cost, first, shape)
-        least.append(best[0])
-        choice.append(best[1:])
-    cut, last = [], len(strokes) - 1
+                best = Cut(least[first] + cost, first, shape)
+        least.append(best.cost)
+        cuts.append(best)
+    found, last = [], len(strokes) - 1
     while last >= 0:
-        first, shape = choice[last]
-        cut.append(shape)
-        last = first - 1
-    return cut[::-1]
+        found.append(cuts[last].shape)
+        last = cuts[last].first - 1
+    return found[::-1]
 
 
 def replaces(shape: Shape, strokes: Sequence[Stroke], yardstick: Yardstick, seen: Seen) -> bool:

@@ -70,16 +70,10 @@ NOWHERE = Agreements(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int), np.ze
 
 
 @dataclass(frozen=True)
-class SweepSeeds:
-    """Agreements (points to pixel) of all views. companions: (n,) see `companions_of`. references: edgels whose rays
-    were swept.
-    """
+class SweepSeeds(Agreements):
+    """The Agreements of all views. companions: (n,) see `companions_of`. references: edgels whose rays were swept."""
 
-    points: np.ndarray
-    directions: np.ndarray
-    views: np.ndarray
     companions: np.ndarray
-    pixel: np.ndarray
     references: int
 
 
@@ -356,7 +350,7 @@ def sweep_seeds(views: Views, report: Callable[[int], None] | None = None) -> Sw
             report(view + 1)
     found = Agreements.joined(parts)
     companions = companions_of(found)
-    return SweepSeeds(found.points, found.directions, found.views, companions, found.pixel, int(chosen.sum()))
+    return SweepSeeds(found.points, found.directions, found.views, found.pixel, companions, int(chosen.sum()))
 
 
 def companions_of(found: Agreements) -> np.ndarray:

@@ -7,7 +7,7 @@ straight and curved stretches; the cluster is cut at both ends of every straight
 
 import numpy as np
 
-from taichi_edges.arrays.ranges import ragged
+from taichi_edges.arrays.ranges import ragged, starts_of
 from taichi_edges.fitting.prices import ARC_PRICE, LINE_PRICE, OUTLIER
 from taichi_edges.strokes.neighbors import UNASSIGNED, members_of_clusters
 from taichi_edges.strokes.ordering import order_points
@@ -103,7 +103,7 @@ def _block_costs(chain: np.ndarray, starts: np.ndarray, ends: np.ndarray, noise:
     """(2, p) costs of the stretches of one block; see `stretch_costs`. t counts all their points, in order."""
     lengths = ends - starts
     of, place = ragged(lengths)  # (t,) the stretch, and 0, 1, .. within it
-    first = np.cumsum(lengths) - lengths
+    first = starts_of(lengths)
     means = np.diff(_running_sums(chain)[np.stack([starts, ends])], axis=0)[0] / lengths[:, None]
     offsets = chain[starts[of] + place].T - np.repeat(means.T, lengths, axis=1)  # (3, t)
 
