@@ -134,7 +134,7 @@ def slow_cuts(chain):
     best = [(0.0, [0], [])]  # cost, bounds and kinds of the cheapest way to each station
     for end in stations[1:]:
         ways = []
-        for (cost, bounds, kinds), start in zip(best, stations, strict=True):
+        for (cost, bounds, kinds), start in zip(best, stations, strict=False):
             line, curve = slow_costs(chain[start:end], noise)
             ways.append((cost + line + LINE_PRICE * price, [*bounds, end], [*kinds, False]))
             ways.append((cost + curve + ARC_PRICE * price, [*bounds, end], [*kinds, True]))
