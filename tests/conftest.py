@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 import taichi as ti
+from seeds import SEED
 
 from taichi_edges.kernels.device import is_running, kernel_cache
 from taichi_edges.splatting.splatter import Splatter
@@ -16,8 +17,6 @@ from taichi_edges.synthetic.drawing import Imperfections
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import render_views
 
-# In the environment, so that pytest-xdist's workers have the same.
-SEED = int(os.environ.setdefault("TEST_SEED", str(np.random.SeedSequence().generate_state(1)[0])))
 REALS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
 # What uses one of these fixtures is slow, as if it were marked so.
@@ -25,6 +24,7 @@ SLOW_FIXTURES = {"finished": "starts from a run of the whole corridor", "solved"
 PROBE = """
 import sys
 import taichi as ti
+from seeds import SEED
 
 ti.init(arch=getattr(ti, sys.argv[1]), offline_cache=False)
 sys.exit(ti.lang.impl.current_cfg().arch != getattr(ti, sys.argv[1]))
