@@ -1,4 +1,4 @@
-"""Parametric 3D edges from posed images and 2D edge maps, by splatting edge Gaussians with Taichi.
+"""Parametric 3D edges from photographs or edge maps, by splatting edge Gaussians with Taichi.
 
 What is listed in `__all__` is the interface for other programs; it is imported when it is asked for, so that importing
 the package itself takes no time.
