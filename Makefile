@@ -7,7 +7,7 @@ WORKERS ?= 2
 TEST_SEED ?= 0
 export TEST_SEED
 # A file of tests stays in one process, for its fixtures and kernels; in the files' order, of which the last are short.
-TESTS := $(RUN) -m pytest -q -rs -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+TESTS := $(RUN) -m pytest -q -rs -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(PYTEST_OPTIONS)
 
 .PHONY: help demo quick test lint setup lock clean
 help: ## list the targets
