@@ -24,7 +24,6 @@ SLOW_FIXTURES = {"finished": "starts from a run of the whole corridor", "solved"
 PROBE = """
 import sys
 import taichi as ti
-from seeds import SEED
 
 ti.init(arch=getattr(ti, sys.argv[1]), offline_cache=False)
 sys.exit(ti.lang.impl.current_cfg().arch != getattr(ti, sys.argv[1]))
