@@ -9,7 +9,6 @@ from functools import cache
 import numpy as np
 import pytest
 import taichi as ti
-from seeds import SEED
 
 from taichi_edges.kernels.device import is_running, kernel_cache
 from taichi_edges.splatting.splatter import Splatter
@@ -17,6 +16,8 @@ from taichi_edges.synthetic.drawing import Imperfections
 from taichi_edges.synthetic.parts import PARTS
 from taichi_edges.synthetic.rendering import render_views
 
+# In the environment, so that pytest-xdist's workers have the same.
+SEED = int(os.environ.setdefault("TEST_SEED", str(np.random.SeedSequence().generate_state(1)[0])))
 REALS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
 # What uses one of these fixtures is slow, as if it were marked so.

@@ -6,7 +6,6 @@ from itertools import combinations
 import numpy as np
 import pytest
 from edgel_scenes import either_errors, views_of
-from seeds import some_seeds_fail
 
 from taichi_edges.corridor.pipeline import Run
 from taichi_edges.corridor.refine import refine
@@ -73,7 +72,6 @@ def off(points, wanted):
     return np.linalg.norm(np.asarray(wanted)[:, None] - points, axis=2).min(axis=1).max()
 
 
-@some_seeds_fail("an edge too many, or one that few views support, in 4 of 160 draws")
 @either_errors()
 @pytest.mark.parametrize("seed", range(2))
 def test_strokes_along_a_box_with_a_hole_become_its_wireframe(taichi, generator, seed, errors):

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from seeds import some_seeds_fail
 
 from taichi_edges.fitting.arcs import Arc, fit_arc
 from taichi_edges.geometry.bezier import bezier_lengths, evaluate_bezier
@@ -308,7 +307,6 @@ def helix(t):
     return np.stack([0.5 + 0.2 * np.cos(6 * np.pi * t), 0.5 + 0.2 * np.sin(6 * np.pi * t), 0.2 + 0.6 * t], axis=1)
 
 
-@some_seeds_fail("an ellipse or the wave in more than one piece, in 2 of 100 draws")
 @pytest.mark.slow(reason="grows thousands of points")
 @pytest.mark.parametrize(("curve", "closed"), [(ellipse, True), (saddle, True), (wave, False), (helix, False)])
 def test_a_free_curve_is_one_edge_and_closes_if_it_is_closed(generator, curve, closed):
