@@ -63,7 +63,7 @@ def test_lines_are_found_to_a_tenth_of_a_pixel_whatever_their_angle_and_contrast
     errors = []
     for angle in generator.uniform(0, 2 * np.pi, 12):
         share, distance = half_plane(angle, generator.uniform(42, 54, 2))
-        points, normals, strengths = detect_edgels(mixed(share, *generator.permutation([0.05, 0.9])))
+        points, normals, strengths, _ = detect_edgels(mixed(share, *generator.permutation([0.05, 0.9])))
         inner = within(points)
         errors.append(distance(points[inner]))
         length = np.ptp(points @ [-np.sin(angle), np.cos(angle)])
@@ -79,7 +79,7 @@ def test_lines_are_found_to_a_tenth_of_a_pixel_whatever_their_angle_and_contrast
 @pytest.mark.parametrize("radius", [5.0, 12.0, 30.0])
 def test_circles_are_found_to_a_tenth_of_a_pixel(radius, generator):
     centre = generator.uniform(46, 50, 2)
-    points, normals, _ = detect_edgels(mixed(disk(centre, radius), 0.6, 0.2))
+    points, normals, *_ = detect_edgels(mixed(disk(centre, radius), 0.6, 0.2))
     away = points - centre
     errors = np.hypot(*away.T) - radius
     assert np.abs(errors).max() < 0.1
@@ -95,7 +95,7 @@ def test_outlines_of_straight_alpha_are_not_biased_and_need_no_background(light,
     colours = np.full((SIZE, SIZE, 3), encoded(light))
     colours[share < 0.004] = generator.integers(0, 256, (SIZE, SIZE, 3), dtype=np.uint8)[share < 0.004]  # garbage
     picture = np.dstack([colours, np.rint(255 * share).astype(np.uint8)])
-    points, _, strengths = detect_edgels(picture)
+    points, _, strengths, _ = detect_edgels(picture)
     errors = distance(points[within(points)])
     assert len(errors) > 0.6 * (SIZE - 2 * BORDER)
     assert np.abs(errors).max() < 0.1
@@ -108,7 +108,7 @@ def test_a_faint_crease_beside_the_outline_is_found():
     crease, from_crease = half_plane(0.3, (43.2, 47.9))
     light = 0.50 + 0.03 * crease
     picture = np.dstack([encoded(light)] * 3 + [np.rint(255 * share).astype(np.uint8)])
-    points, _, _ = detect_edgels(picture)
+    points, *_ = detect_edgels(picture)
     on_crease = np.abs(from_crease(points)) < 1
     assert on_crease.sum() > 0.8 * SIZE
     assert np.abs(np.median(from_crease(points[on_crease]))) < 0.1
@@ -118,7 +118,7 @@ def test_a_faint_crease_beside_the_outline_is_found():
 def test_an_edge_between_colours_of_equal_brightness_is_found():
     share, distance = half_plane(0.8, (48.3, 47.6))
     picture = mixed(share, [0.3, 0.4, 0.5], [0.5, 0.4, 0.3])  # one mean, and one green
-    points, _, _ = detect_edgels(picture)
+    points, *_ = detect_edgels(picture)
     inner = within(points)
     assert inner.sum() > 60
     assert np.abs(distance(points[inner])).max() < 0.1
@@ -129,7 +129,7 @@ def test_a_long_faint_crease_is_found_in_noise_that_alone_gives_next_to_nothing(
     level, step, sigma = 120.0, 6.0, 2.0  # grey levels
     blank = np.full((SIZE, SIZE, 3), level)
     crease = blank + step * share[:, :, None]
-    points, _, _ = detect_edgels(noisy(crease, sigma, generator))
+    points, *_ = detect_edgels(noisy(crease, sigma, generator))
     near = np.abs(distance(points)) < 1.5
     assert near.sum() > 0.7 * SIZE
     assert (~near).sum() < 0.1 * SIZE
@@ -143,7 +143,7 @@ def test_two_edges_three_pixels_apart_are_two(lights):
     first, from_first = half_plane(0.5, (47.0, 48.0))
     second, from_second = half_plane(0.5, (47.0 + 3 * np.cos(0.5), 48.0 + 3 * np.sin(0.5)))
     light = lights[0] + (lights[1] - lights[0]) * first + (lights[2] - lights[1]) * second
-    points, _, _ = detect_edgels(encoded(light))
+    points, *_ = detect_edgels(encoded(light))
     for distance in (from_first, from_second):
         errors = distance(points[within(points)])
         near = np.abs(errors) < 0.5
@@ -167,7 +167,7 @@ def test_texture_gives_few_edgels_and_an_edge_across_it_stands_out(generator):
     texture = cv2.GaussianBlur(generator.standard_normal((SIZE, SIZE)), (0, 0), 1.0)
     grain = np.clip(120 + 40 * texture, 0, 255)
     assert len(detect_edgels(grain.astype(np.uint8))[0]) < 0.02 * SIZE**2
-    points, _, _ = detect_edgels(np.clip(grain - 60 + 120 * share, 0, 255).astype(np.uint8))
+    points, *_ = detect_edgels(np.clip(grain - 60 + 120 * share, 0, 255).astype(np.uint8))
     assert (np.abs(distance(points)) < 2).sum() > 0.7 * SIZE
 
 

@@ -138,18 +138,15 @@ def _calibrate(run: "Run", views: Views, thin: Views) -> "tuple[Edgels, Calibrat
     """The edgels without the detector's biases, and the Calibration. thin: the views with maps drawn thin."""
     from taichi_edges.calibration.calibration import calibrate
     from taichi_edges.kernels.device import kernel_cache, start_taichi
-    from taichi_edges.seeding.voting import vote_seeds
+    from taichi_edges.seeding.proposals import likely_points
 
     start_taichi("cpu", run.threads, run.config.seed, kernel_cache())  # here as everywhere: prepare is no GPU's work
-    generator = np.random.default_rng(run.config.seed)
-    seeds = vote_seeds(thin, run.config.train.edge_threshold, generator, CALIBRATION_SEEDS)
+    points, directions = likely_points(thin, CALIBRATION_SEEDS)
     wanted, edgels = run.config.calibration, _traced_edgels(views)
     shift = {"off": (0.0, 0.0), "auto": None}[wanted.shift] if isinstance(wanted.shift, str) else wanted.shift
     fixed = {"off": 0.0, "auto": None}
     silhouette = fixed[wanted.silhouette] if isinstance(wanted.silhouette, str) else wanted.silhouette
-    return calibrate(
-        with_whole_paths(run, views), edgels, seeds.points, seeds.directions, shift, silhouette, run.threads
-    )
+    return calibrate(with_whole_paths(run, views), edgels, points, directions, shift, silhouette, run.threads)
 
 
 def _corrected(run: "Run", views: Views, calibration: "Calibration | None") -> Views:

@@ -22,7 +22,7 @@ def train(run: "Run") -> dict[str, Any]:
     config, views = run.config.train, read_views(run.path("views.npz"))
     generator = np.random.default_rng(run.config.seed)
     start_taichi(run.arch, run.threads, run.config.seed, kernel_cache())
-    start = start_of_training(run, views, generator)
+    start, strokes = start_of_training(run, views, generator)
     training = Training(views, config, generator, run.threads, run.arch)
     gaussians, records = training.run(start, run.progress)
     rows = [(r.step, f"{r.seconds:.3f}", f"{r.loss:.6f}", r.gaussians) for r in records]
@@ -30,32 +30,37 @@ def train(run: "Run") -> dict[str, Any]:
     similarity = views.similarity
     write_gaussians(
         run.path("gaussians.ply"),
-        similarity.to_input(gaussians.means).astype(np.float32),
+        similarity.to_input(gaussians.means.astype(np.float64)),
         gaussians.log_scales - np.float32(np.log(similarity.scale)),
         gaussians.quaternions,
         gaussians.opacity_logits,
+        strokes,
     )
     loss = records[-1].loss if np.isfinite(records[-1].loss) else None  # no step may have measured it alone
     return {"gaussians": len(gaussians), "view_steps": records[-1].step, "final_loss": loss}
 
 
-def start_of_training(run: "Run", views: Views, generator: np.random.Generator) -> "Gaussians":
-    """The Gaussians that training starts from, as `train.seeds` says."""
+def start_of_training(
+    run: "Run", views: Views, generator: np.random.Generator
+) -> "tuple[Gaussians, np.ndarray | None]":
+    """The Gaussians that training starts from, as `train.seeds` says; and (n,) the stroke of each, None without."""
     from taichi_edges.files.ply import read_vertices, stack_fields
-    from taichi_edges.seeding.starts import LEAST_VOTED, given_points, random_points, voted_gaussians
+    from taichi_edges.seeding.starts import LEAST_SEEDS, given_points, random_points
     from taichi_edges.splatting.gaussians import start_gaussians
 
     config = run.config.train
     seeds: str = config.seeds
-    if seeds in ("votes", "sweep"):
-        found, seeds = _swept(run, views) if seeds == "sweep" else (None, seeds)
-        if seeds == "votes":
-            found = voted_gaussians(views, config.edge_threshold, config.gaussians, config.initial_opacity, generator)
+    if seeds in ("lift", "sweep"):
+        found, strokes = None, None
+        if seeds == "sweep":
+            found, seeds = _swept(run, views)
+        if seeds == "lift":
+            found, strokes = _lifted(run, views)
         if found is not None:
-            return found
+            return found, strokes
         seeds = "points" if run.path("seeds.ply").is_file() else "random"
         instead = {"points": "the given points", "random": "random points"}[seeds]
-        problem = f"the views agree on an edge in fewer than {LEAST_VOTED} places"
+        problem = f"the views agree on an edge in fewer than {LEAST_SEEDS} places"
         run.progress.warn(f"{problem}: {WRONG_CAMERAS}; the training starts from {instead} instead")
     if seeds == "random" or not run.path("seeds.ply").is_file():
         points = random_points(config.gaussians, views.box, generator)
@@ -65,16 +70,31 @@ def start_of_training(run: "Run", views: Views, generator: np.random.Generator) 
         if seeds == "auto":  # structure from motion finds few points where there is no texture
             more = random_points(config.gaussians - len(points), views.box, generator)
             points = np.concatenate([points, more])
-    return start_gaussians(points, generator, config.initial_scale, config.initial_opacity)
+    return start_gaussians(points, generator, config.initial_scale, config.initial_opacity), None
+
+
+def _lifted(run: "Run", views: Views) -> "tuple[Gaussians | None, np.ndarray | None]":
+    """Gaussians laid along the strokes that explain the edgels, and their strokes; None where they are too few."""
+    from taichi_edges.evidence.edgel_matching import EdgelMatching
+    from taichi_edges.seeding.proposals import propose
+    from taichi_edges.seeding.starts import LEAST_SEEDS, stroke_gaussians
+
+    config = run.config.train
+    matching = EdgelMatching(views, run.config.filter.min_views)
+    with run.progress.track("lift", len(views)) as report:
+        strokes = propose(views, matching, report).strokes
+    if len(strokes) < min(LEAST_SEEDS, config.gaussians):
+        return None, None
+    return stroke_gaussians(strokes, matching.pixel, config.gaussians, config.initial_opacity)
 
 
 def _swept(run: "Run", views: Views) -> "tuple[Gaussians | None, str]":
-    """Gaussians by sweeping, None where views agree in too few places; and the seeds to use: 'votes' if none can be."""
+    """Gaussians by sweeping, None where views agree in too few places; and the seeds to use: 'lift' if none can be."""
     from taichi_edges.seeding.sweeping import TOGETHER, can_sweep, swept_gaussians
 
     found = swept_gaussians(views, run.config.train.gaussians, run.config.train.initial_opacity, run.progress)
     if found is not None or can_sweep(views):
         return found, "sweep"
     problem = f"fewer than {TOGETHER + 1} views see the same, and the sweep needs so many"
-    run.progress.warn(f"{problem}: take more pictures, each from near the one before; the training starts from votes")
-    return None, "votes"
+    run.progress.warn(f"{problem}: take more pictures, each from near the one before; the edgels are lifted instead")
+    return None, "lift"

@@ -54,6 +54,7 @@ WINDING = 5.0  # votes lost when the mean of the normals falls by 1
 MAX_TURN = np.cos(np.radians(50.0))  # from one maximum to the next of a chain
 MIN_CHORD = 3.0  # px; of nearer ends the directions say little about the curvature
 MAX_CURVATURE = 0.25  # 1 / px; a corner is no circle of a smaller radius
+WIDEST = 4.0  # px; what is blurred by more has no width that neighbouring pixels could tell
 MIN_RUN = 5  # maxima; what remains of a coarse chain beside finer ones must be longer
 HALF_SURE = 12.0  # ratio of an edge that gets the strength 0.5
 
@@ -86,7 +87,8 @@ class Maxima(Columns):
     """Maxima of the gradient across the edge.
 
     rows, columns: (n,) their pixels. points: (n, 2) pixels (u, v). normals: (n, 2) unit, towards more light.
-    ratios: (n,) how far they stand out of what is beside them, in units of the clutter.
+    ratios: (n,) how far they stand out of what is beside them, in units of the clutter. widths: (n,) px^2, variance of
+    the gradient's profile across the edge, a Gaussian where the edge is a blurred step.
     """
 
     rows: np.ndarray
@@ -94,6 +96,7 @@ class Maxima(Columns):
     points: np.ndarray
     normals: np.ndarray
     ratios: np.ndarray
+    widths: np.ndarray
 
 
 def trace_pictures(
@@ -109,9 +112,9 @@ def trace_pictures(
     UserError where an image cannot be read.
     """
 
-    def trace(path: Path | str) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[int, int] | None]:
+    def trace(path: Path | str) -> tuple[tuple[np.ndarray, ...], tuple[int, int] | None]:
         if not path:
-            return _arrays([]), None
+            return _arrays([], []), None
         picture = read_picture(path, exponent)
         height, width = picture.light.shape[:2]
         return detect_edgels(picture), (width, height)
@@ -129,35 +132,39 @@ def trace_pictures(
     return Edgels.of_views(views), sizes
 
 
-def detect_edgels(image: Picture | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def detect_edgels(image: Picture | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Edgels of one image: a Picture, or an array that `as_picture` accepts.
 
     Returns points (n, 2) as (u, v), pixel centres at integers, 0.7 to 1.4 for each pixel of an edge's length; unit
     normals (n, 2) across the edge, towards more light; strengths (n,) in 0..1: r / (r + HALF_SURE) for an edge that
-    stands out r times from the clutter around it. The faintest have about 0.2, and clear ones more than 0.5.
+    stands out r times from the clutter around it. The faintest have about 0.2, and clear ones more than 0.5. And blurs
+    (n,), see `Edgels`.
     """
     picture = image if isinstance(image, Picture) else as_picture(image)
     shape = picture.light.shape[:2]
     if min(shape) <= 2 * MARGIN:
-        return _arrays([])
+        return _arrays([], [])
     taken = np.zeros(shape, bool)  # pixels with an edgel
     layers: list[Maxima] = []
+    blurs: list[float] = []
     for field in _fields(picture):
         edges, runs = _chained(_maxima(field, _clutter(field)), shape, field.blur)
         free = ~_beside_taken(taken, edges, 1.5 * field.sigma)
         layers.append(edges.keep(_long_runs(free, runs)))
         taken[layers[-1].rows, layers[-1].columns] = True
-    return _arrays(layers)
+        blurs.append(field.blur)
+    return _arrays(layers, blurs)
 
 
-def _arrays(layers: list[Maxima]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (n, 2), normals (n, 2) and strengths (n,) of several Maxima."""
+def _arrays(layers: list[Maxima], blurs: list[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Points (n, 2), normals (n, 2), strengths (n,) and blurs (n,) of several Maxima. blurs: px, of their Fields."""
     points, normals = (
         np.concatenate([np.zeros((0, 2)), *(getattr(layer, name) for layer in layers)])
         for name in ("points", "normals")
     )
     ratios = np.concatenate([np.zeros(0), *(layer.ratios for layer in layers)]).clip(min=0.0)
-    return points, normals, ratios / (ratios + HALF_SURE)
+    own = [np.sqrt(np.maximum(layer.widths - blur**2, 0.0)) for layer, blur in zip(layers, blurs, strict=True)]
+    return points, normals, ratios / (ratios + HALF_SURE), np.concatenate([np.zeros(0), *own])
 
 
 def _fields(picture: Picture) -> Iterator[Field]:
@@ -238,13 +245,14 @@ def _maxima(field: Field, clutter: np.ndarray) -> Maxima:
     gx, gy = field.gx[rows, columns], field.gy[rows, columns]
     size = np.sqrt(squares[rows, columns])
     normals = np.stack([gx, gy], axis=1) / size[:, None]
-    offsets = _offsets(squares, rows, columns, normals)
+    offsets, widths = _offsets(squares, rows, columns, normals)
     near = np.abs(offsets) < 1
-    rows, columns, size, normals, offsets = (array[near] for array in (rows, columns, size, normals, offsets))
+    found = (rows, columns, size, normals, offsets, widths)
+    rows, columns, size, normals, offsets, widths = (array[near] for array in found)
     points = np.stack([columns, rows], axis=1).astype(np.float32) + offsets[:, None] * normals
     standing_out = size - _beside(field, rows, columns, normals)
     ratios = standing_out * (field.levels / clutter)[rows, columns]
-    return Maxima(rows, columns, points, normals, ratios).keep(ratios > LOW)
+    return Maxima(rows, columns, points, normals, ratios, widths).keep(ratios > LOW)
 
 
 def _candidates(field: Field, squares: np.ndarray, clutter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -268,8 +276,11 @@ def _candidates(field: Field, squares: np.ndarray, clutter: np.ndarray) -> tuple
     return rows[top], columns[top]
 
 
-def _offsets(squares: np.ndarray, rows: np.ndarray, columns: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(n,) pixels from the pixel's centre to the maximum along the normal; infinite where there is none.
+def _offsets(
+    squares: np.ndarray, rows: np.ndarray, columns: np.ndarray, normals: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) pixels from the pixel's centre to the maximum along the normal; infinite where there is none. And (n,) px^2,
+    the variance of the gradient along it, at most WIDEST^2.
 
     The gradient across a blurred step is a Gaussian, the logarithm of which is a parabola: differences over the eight
     neighbours give its top without error.
@@ -286,7 +297,9 @@ def _offsets(squares: np.ndarray, rows: np.ndarray, columns: np.ndarray, normals
     nx, ny = normals.T
     curvature = xx * nx * nx + 2 * xy * nx * ny + yy * ny * ny
     slope = x * nx + y * ny
-    return np.divide(-slope, curvature, out=np.full(len(rows), np.inf, np.float32), where=curvature < 0)
+    offsets = np.divide(-slope, curvature, out=np.full(len(rows), np.inf, np.float32), where=curvature < 0)
+    widths = np.divide(-2.0, curvature, out=np.full(len(rows), WIDEST**2, np.float32), where=curvature < 0)
+    return offsets, np.minimum(widths, WIDEST**2)
 
 
 def _beside(field: Field, rows: np.ndarray, columns: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -323,7 +336,7 @@ def _chained(maxima: Maxima, shape: tuple[int, ...], blur: float) -> tuple[Maxim
     kept = goes_on & (np.bincount(runs, votes)[runs] >= ENOUGH)
     shifts = 0.5 * blur**2 * _curvatures(maxima, low, high - 1)
     points = maxima.points + shifts[:, None] * maxima.normals
-    smoothed = Maxima(maxima.rows, maxima.columns, points, maxima.normals, mean(maxima.ratios))
+    smoothed = Maxima(maxima.rows, maxima.columns, points, maxima.normals, mean(maxima.ratios), mean(maxima.widths))
     return smoothed.keep(kept), runs[kept]
 
 

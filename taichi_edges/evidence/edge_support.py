@@ -13,8 +13,8 @@ from scipy.special import gammainc
 
 from taichi_edges.arrays.robust import NORMAL_MAD, geman_mcclure
 from taichi_edges.evidence.edgel_matching import EdgelMatching
-from taichi_edges.evidence.explaining import BEST_SUPPORTED, TIGHT_NOISES, TIGHT_PX
 from taichi_edges.evidence.lying import EdgelsAbout, steadiness
+from taichi_edges.evidence.noise import BEST_SUPPORTED
 from taichi_edges.geometry.shapes import Shape
 from taichi_edges.geometry.wireframe import Evidence
 from taichi_edges.views.edgels import MOST_SINE
@@ -26,6 +26,7 @@ CHORDS = 64  # for each cubic: where places at equal distances along a shape are
 CORE, CORE_ROUNDS = 3.0, 8  # standard deviations of the core; rounds in which it is found
 TIE_NOISES = 3.0  # of the noise: what cannot make the worse of two edges the nearer one
 ABOUT, MOST_ABOUT_PX = 6.0, 4.0  # an edgel within so many times the distance at which it is on an edge is about it
+TIGHT_PX, TIGHT_NOISES = 0.25, 2.0  # residuals of an edge: within the first, or within so many times the noise
 PLANES = 2  # those of two views always meet
 
 

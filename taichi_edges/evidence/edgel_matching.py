@@ -61,6 +61,22 @@ class EdgelMatching:
         return np.where(beside <= OWNED_BESIDE_PX, near, own)
 
     @cached_property
+    def plane_normals(self) -> np.ndarray:
+        """(e, 3) normals of the edgels' viewing planes in space, not of unit length."""
+        return np.einsum("nj,njk->nk", self._lines, self.projections[self.edgels.views, :, :3])
+
+    @property
+    def _lines(self) -> np.ndarray:
+        """(e, 3) the edgels as homogeneous lines."""
+        points, normals = self.edgels.points.astype(np.float64), self.edgels.normals.astype(np.float64)
+        return np.column_stack([normals, -(normals * points).sum(axis=1)])
+
+    @cached_property
+    def edgel_blurs(self) -> np.ndarray:
+        """(e + 1,) blurs of the edgels, px; the last one, that of no edgel, NaN."""
+        return np.append(self.edgels.blurs, np.float32(np.nan))
+
+    @cached_property
     def densities(self) -> list[tuple[float, float]]:
         """[(sum of strengths, px^2)] of the edgels of each view that has any, and of the box around them."""
         views = [self.edgels.of_view(view) for view in range(self.edgels.view_count)]

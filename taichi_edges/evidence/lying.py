@@ -40,6 +40,10 @@ class EdgelsAbout:
         views = slice(0, matching.edgels.view_count) if views is None else views
         return EdgelsAbout(*matching.matches(points, directions, views, radius))
 
+    def keep(self, some: slice) -> "EdgelsAbout":
+        """Those of some of the places."""
+        return EdgelsAbout(self.edgels[some], self.residuals[some], self.inside[some])
+
     @property
     def there(self) -> np.ndarray:
         """(n, v) bool: where there is an edgel."""
@@ -48,6 +52,10 @@ class EdgelsAbout:
     def within(self, px: float) -> np.ndarray:
         """(n, v) bool: where there is an edgel no farther than so many pixels across."""
         return self.there & (np.abs(self.residuals) <= px)
+
+    def closeness(self, px: float) -> np.ndarray:
+        """(n, v) of the edgels: 1 on the place, 0 from so many pixels across on, and where there is none."""
+        return np.where(self.there, 1.0 - np.minimum((self.residuals / px) ** 2, 1.0), 0.0)
 
 
 def steadiness(on: Counts, about: Counts) -> Counts:

@@ -40,20 +40,25 @@ class RefinedPoints(Columns):
 
 
 def refine_points(
-    matching: "EdgelMatching", points: np.ndarray, directions: np.ndarray, radii: Sequence[float] = RADII_PX
+    matching: "EdgelMatching",
+    points: np.ndarray,
+    directions: np.ndarray,
+    radii: Sequence[float] = RADII_PX,
+    scale: float | None = None,
 ) -> RefinedPoints:
     """Points and directions moved to the robust intersection of the viewing planes of their edgels.
 
     matching: EdgelMatching. points: (n, 3) unit cube. directions: (n, 3) unit vectors. radii: px, one for each round,
-    in which no point moves by more than that.
+    in which no point moves by more than that. scale: px, of the robust weights; None for that of the matching.
     """
+    scale = matching.scale_px if scale is None else scale
     points, directions = np.array(points, np.float64), np.array(directions, np.float64)
     for radius in radii:
-        equations = matching.equations(points, directions, radius, matching.scale_px)
+        equations = matching.equations(points, directions, radius, scale)
         steps, directions = _solve(equations, directions)
         lengths = np.linalg.norm(steps, axis=1, keepdims=True)
         points += steps * np.minimum(1.0, radius * matching.pixel / np.maximum(lengths, 1e-300))
-    equations = matching.equations(points, directions, radii[-1], matching.scale_px)
+    equations = matching.equations(points, directions, radii[-1], scale)
     values = np.linalg.eigh(equations.matrices)[0]
     spread, views = np.maximum(values[:, 1], 0.0) / np.maximum(values[:, 2], 1e-12), equations.weights
     return RefinedPoints(points, directions, views, views / np.maximum(equations.views, 1.0), spread)

@@ -18,6 +18,8 @@ from taichi_edges.evidence.edge_support import (
     support_share,
 )
 from taichi_edges.evidence.edgel_matching import EdgelMatching
+from taichi_edges.evidence.noise import LEAST_NOISE_PX, MOST_NOISE_PX
+from taichi_edges.evidence.verdict import marks_of, probabilities
 from taichi_edges.fitting.model_selection import Yardstick
 from taichi_edges.geometry.shapes import Shape
 from taichi_edges.geometry.wireframe import Wireframe
@@ -39,6 +41,7 @@ WIDE_GAP_PX = 24.0  # between strokes that continue each other, where their ends
 MOST_COMPARED = 150  # edges whose relations are counted where nobody asked for them: there are as many as its square
 LEAST_CONFIDENCE = 0.2  # of an edge, see `edge_support.evidence_of`
 LENIENT = 0.75  # of the steadiness, for edges that have not been adjusted
+DOUBTED = 0.3  # of the least confidence, for the same: ends that are not in place yet tell against an edge
 LEAST_SUPPORTED = 0.33  # of the length of an edge; where edges touch, only one of them owns the edgels
 
 
@@ -117,14 +120,26 @@ def with_evidence(wireframe: Wireframe, matching: EdgelMatching, config: "Refine
     """The Wireframe with what the images say about each edge, and without those they do not support."""
     support = support_of(matching, wireframe.shapes)
     found = evidence_of(support)
+    if config.verdict:
+        likely = probabilities(marks_of(matching, wireframe.shapes, edgel_noise(support)))
+        found = [replace(of, confidence=float(p)) for of, p in zip(found, likely, strict=True)]
     edges = tuple(replace(edge, evidence=of) for edge, of in zip(wireframe.edges, found, strict=True))
-    sure = np.array([of.confidence >= LEAST_CONFIDENCE for of in found], dtype=bool)
+    least = config.min_confidence if config.verdict else LEAST_CONFIDENCE
+    sure = np.array([of.confidence >= least for of in found], dtype=bool)
     return replace(wireframe, edges=edges).keep(sure & is_edge(matching, support, wireframe.shapes, config))
+
+
+def edgel_noise(support: Support) -> float:
+    """Standard deviation of the edgels of a Support across their edges, px."""
+    return float(np.clip(support.noise_px, LEAST_NOISE_PX, MOST_NOISE_PX))
 
 
 def with_support(matching: EdgelMatching, shapes: Sequence[Shape], config: "RefineConfig") -> list[Shape]:
     """The shapes that the images support; their places are not exact yet."""
-    kept = is_edge(matching, support_of(matching, shapes), shapes, config, LENIENT)
+    support = support_of(matching, shapes)
+    kept = is_edge(matching, support, shapes, config, LENIENT)
+    if config.verdict:
+        kept &= probabilities(marks_of(matching, shapes, edgel_noise(support))) >= DOUBTED * config.min_confidence
     return [shape for shape, keep in zip(shapes, kept, strict=True) if keep]
 
 

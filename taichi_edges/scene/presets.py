@@ -42,7 +42,7 @@ PAPER: dict[str, dict[str, Any]] = {
         },
     },
     "calibration": {"shift": "off", "silhouette": "off"},
-    "filter": {"refine": False},
+    "filter": {"refine": False, "min_opacity": 0.2},
     "refine": {"enabled": False},
 }
 
@@ -66,18 +66,19 @@ LARGE_IN_THE_PAPER: dict[
 # Photographs of what surrounds the camera: much texture, poses from structure from motion, few views of every place.
 PHOTOGRAPHED: dict[str, dict[str, Any]] = {
     "source": {"min_chain": 12, "tolerance_px": 0.7},
-    "train": {"seeds": "sweep", "gaussians": 60_000, "steps": 200, "learning_rates": {"means": 1e-4}},
+    "train": {
+        "seeds": "sweep",
+        "gaussians": 60_000,
+        "steps": 200,
+        "density": {"cull_opacity_at": [0.7], "cull_support_at": [0.5, 0.75]},
+    },
     "filter": {
+        "min_opacity": 0.2,
         "min_support": 0.15,
         "min_views": 2.2,
-        "min_steadiness": 0.0,
-        "min_evidence": 0.0,
-        "min_angle": 0.0,
-        "harvest": False,
-        "grow": 0.0,
     },
     "cluster": {"min_points": 5, "max_gap": 0.015},
-    "refine": {"min_support": 0.15, "min_views": 2.0, "min_steadiness": 0.3},
+    "refine": {"min_support": 0.15, "min_views": 2.0, "min_steadiness": 0.3, "verdict": False},
 }
 # Photographers walk along facades, so that the depth of horizontal edges is for others to tell.
 SURROUNDING: dict[str, dict[str, Any]] = {

@@ -127,7 +127,7 @@ class CalibrationConfig(Section):
 class LearningRates(Section):
     """Adam's rates."""
 
-    means: NotNegative = Field(2e-3, description="unit-cube units per step")
+    means: NotNegative = Field(1e-4, description="unit-cube units per step")
     scales: NotNegative = Field(5e-3, description="of the logarithm, per step")
     opacities: NotNegative = Field(3e-2, description="of the logit, per step")
     quaternions: NotNegative = Field(5e-3, description="per step")
@@ -141,9 +141,9 @@ class DensityConfig(Section):
     duplicate_copies: Annotated[int, Field(ge=0)] = Field(2, description="copies of each")
     duplicate_distance: NotNegative = Field(0.01, description="standard deviation of a copy's offset, unit-cube units")
     max_gaussians: Count = Field(50_000, description="no duplication beyond this number")
-    cull_opacity_at: list[Share] = Field([0.7], description="shares of the run")
+    cull_opacity_at: list[Share] = Field([], description="shares of the run")
     min_opacity: Share = Field(0.05, description="Gaussians below are culled")
-    cull_support_at: list[Share] = Field([0.5, 0.75], description="shares of the run")
+    cull_support_at: list[Share] = Field([], description="shares of the run")
     min_support: Share = Field(0.05, description="share of the views whose edge pixels a centre must hit")
     reset_opacity: bool = Field(False, description="opacities down to the initial one after a cull")
 
@@ -156,15 +156,15 @@ class TrainConfig(Section):
     """
 
     epochs: Annotated[int, Field(ge=0)] = Field(0, description="passes over all views; 0: train.steps counts")
-    steps: Annotated[int, Field(ge=0)] = Field(500, description="view steps, at least one pass; 0: train.epochs counts")
+    steps: Annotated[int, Field(ge=0)] = Field(100, description="view steps, at least one pass; 0: train.epochs counts")
     settled: Share = Field(
         0.01, description="stop when the last two passes lowered the loss by no more than this share each; 0: never"
     )
-    gaussians: Count = Field(10_000, description="to start from, at most; random: so many")
-    seeds: Literal["auto", "random", "points", "votes", "sweep"] = Field(
-        "votes",
-        description="random points in the box; points: source.points or the model's; votes: where many views agree on"
-        " an edge; auto: points as far as there are any, else random",
+    gaussians: Count = Field(30_000, description="to start from, at most; random: so many")
+    seeds: Literal["auto", "random", "points", "lift", "sweep"] = Field(
+        "lift",
+        description="random points in the box; points: source.points or the model's; lift: along strokes of edgels that"
+        " other views agree with; sweep: the same by single edgels; auto: points as far as there are any, else random",
     )
     initial_scale: Positive = Field(0.004, description="standard deviation, unit-cube units")
     initial_opacity: Annotated[float, Field(gt=0, lt=1)] = Field(0.3)
@@ -210,24 +210,12 @@ class TrainConfig(Section):
 class FilterConfig(Section):
     """Which trained Gaussians become oriented points."""
 
-    min_opacity: Share = Field(0.2)
+    min_opacity: Share = Field(0.02)
     min_support: Share = Field(
         0.05, description="share of the views that see a point and have an edge pixel (refine: edgel) of its own there"
     )
     refine: bool = Field(True, description="move points to where the viewing planes of their edgels meet")
-    min_views: Positive = Field(3.0, description="refine: views that must show an edge, each counted by its strength")
-    min_steadiness: Share = Field(
-        0.54, description="refine: share of the unexplained edgels near a point that lie on it, relative to sure edges"
-    )
-    min_evidence: NotNegative = Field(
-        0.7,
-        description="refine: that an edge is no passing contour, log likelihood ratio from its views; 0: not tested",
-    )
-    min_angle: Annotated[float, Field(ge=0, le=90)] = Field(
-        15.0, description="refine: an edge that few views see is seen from directions so far from their mean, degrees"
-    )
-    harvest: bool = Field(True, description="refine: look once more for edges seen in few views")
-    grow: Share = Field(0.2, description="refine: continue edges where this share of the views agrees; 0: do not")
+    min_views: Positive = Field(2.5, description="refine: views that must show an edge, each counted by how closely")
     outlier_neighbors: Annotated[int, Field(ge=0)] = Field(3, description="statistical outliers: neighbours; 0: off")
     outlier_deviations: Positive = Field(5.0, description="mean neighbour distance allowed, standard deviations")
 
@@ -256,8 +244,12 @@ class RefineConfig(Section):
     min_support: Share = Field(0.0, description="share of the views with an edge in their image that must show it")
     min_views: Positive = Field(2.5, description="views that must show an edge, each counted by its strength")
     min_steadiness: Share = Field(
-        0.66, description="share of the edgels about an edge that lie on it; contours have half"
+        0.0, description="share of the edgels about an edge that lie on it; contours have half"
     )
+    verdict: bool = Field(
+        True, description="confidence is a probability, from all that the edgels say, fitted to parts without texture"
+    )
+    min_confidence: Share = Field(0.5, description="verdict: of an edge that is kept")
     anchor: bool = Field(
         False, description="anchor straight edges whose depth the views cannot tell to known edges that they meet"
     )

@@ -4,14 +4,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taichi_edges.seeding.voting import vote_seeds
 from taichi_edges.splatting.gaussians import Gaussians, orient_gaussians
 
 if TYPE_CHECKING:
-    from taichi_edges.views.views import Views
+    from taichi_edges.seeding.tracing import Strokes
 
-ALONG_PX, ACROSS_PX = 2.0, 0.7  # standard deviations of a voted Gaussian, in pixels at the scene
-LEAST_VOTED = 50  # fewer seeds than this are no start
+ALONG_PX, ACROSS_PX = 2.0, 0.7  # standard deviations of a Gaussian laid along an edge, in pixels at the scene
+LEAST_SEEDS = 50  # fewer are no start
 
 
 def random_points(count: int, box: np.ndarray, generator: np.random.Generator) -> np.ndarray:
@@ -27,15 +26,11 @@ def given_points(points: np.ndarray, count: int, generator: np.random.Generator)
     return points[np.sort(generator.choice(len(points), count, replace=False))]
 
 
-def voted_gaussians(
-    views: "Views", edge_threshold: float, count: int, opacity: float, generator: np.random.Generator
-) -> Gaussians | None:
-    """At most `count` Gaussians where many views agree that an edge passes, laid along it; None if too few.
+def stroke_gaussians(strokes: "Strokes", pixel: float, count: int, opacity: float) -> tuple[Gaussians, np.ndarray]:
+    """Gaussians laid along Strokes, at most `count`, evenly; and (n,) the stroke of each.
 
-    ti.init must have been called. edge_threshold: of full scale. opacity: 0..1.
+    pixel: size of a pixel at the scene, unit-cube units. opacity: 0..1.
     """
-    seeds = vote_seeds(views, edge_threshold, generator, count)
-    if len(seeds.points) < min(LEAST_VOTED, count):
-        return None
-    along, across = ALONG_PX * seeds.pixel, ACROSS_PX * seeds.pixel
-    return orient_gaussians(seeds.points, seeds.directions, along, across, opacity)
+    some = strokes.keep(slice(None, None, max(-(-len(strokes) // count), 1)))
+    laid = orient_gaussians(some.points, some.directions, ALONG_PX * pixel, ACROSS_PX * pixel, opacity)
+    return laid, some.numbers

@@ -19,7 +19,8 @@ from taichi_edges.arrays.columns import Columns
 from taichi_edges.detectors.chains import chain_lengths
 from taichi_edges.kernels.device import download, upload
 from taichi_edges.kernels.points import F32_1D, F32_2D, I32_1D, I32_2D, U8_3D
-from taichi_edges.seeding.starts import ACROSS_PX, ALONG_PX, LEAST_VOTED
+from taichi_edges.seeding.boxes import through_box
+from taichi_edges.seeding.starts import ACROSS_PX, ALONG_PX, LEAST_SEEDS
 from taichi_edges.splatting.gaussians import Gaussians, orient_gaussians
 from taichi_edges.views.cameras import NEAR, SWEPT_FROM, inside_image, project
 from taichi_edges.views.views import Views, pixel_size
@@ -313,13 +314,6 @@ def sweep_view(views: Views, view: int, chosen: np.ndarray, others: np.ndarray, 
     return Agreements(points, directions, counts[which, slot] + 1, pixel)
 
 
-def through_box(origin: np.ndarray, rays: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where (n, 3) rays enter and leave the box (2, 3), (n,) in multiples of them; not in order where they miss it."""
-    with np.errstate(divide="ignore", invalid="ignore"):  # along a side: infinite; in a side: NaN, which is not inside
-        sides = (box[:, None] - origin) / rays
-    return np.minimum(*sides).max(axis=1), np.maximum(*sides).min(axis=1)
-
-
 def references(edgels: "Edgels", lengths: np.ndarray) -> np.ndarray:
     """(e,) bool: one of the Edgels in each cell of EVERY_PX px, that on the longest chain, if this is long.
 
@@ -386,7 +380,7 @@ def swept_gaussians(views: Views, count: int, opacity: float, progress: "Progres
     with progress.track("sweep", len(views)) as report:
         seeds = sweep_seeds(views, report)
     chosen = best_seeds(seeds, views, count)
-    if len(chosen) < min(LEAST_VOTED, count):
+    if len(chosen) < min(LEAST_SEEDS, count):
         return None
     along, across = ALONG_PX * pixel_size(views), ACROSS_PX * pixel_size(views)
     return orient_gaussians(seeds.points[chosen], seeds.directions[chosen], along, across, opacity)

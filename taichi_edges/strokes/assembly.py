@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taichi_edges.fitting.arcs import Arc
+from taichi_edges.fitting.model_selection import Yardstick
 from taichi_edges.geometry.shapes import Line
 from taichi_edges.geometry.wireframe import Wireframe
 from taichi_edges.strokes.arc_growth import Cloud
@@ -14,6 +15,7 @@ from taichi_edges.strokes.claiming import claims
 from taichi_edges.strokes.cluster_fits import NOISE_FLOOR, ClusterFit, fit_cluster, fit_line, wireframe_of
 from taichi_edges.strokes.clustering import grow_clusters, seed_order
 from taichi_edges.strokes.clusters import Clusters
+from taichi_edges.strokes.cutting import cut_stroke, shape_of_stretch
 from taichi_edges.strokes.free_curves import free_curves
 from taichi_edges.strokes.merging import merged
 from taichi_edges.strokes.neighbors import UNASSIGNED, NeighborGraph, alignment, members_of_clusters, neighbor_graph
@@ -79,6 +81,32 @@ def left_over(cloud: Cloud, graph: NeighborGraph, owner: np.ndarray, config: "Cl
     found = separate_branches(points, grow_clusters(points, directions, config), config.min_points)
     labels[left] = split_clusters(points, found, config.min_points)
     return labels
+
+
+def assemble_strokes(points: np.ndarray, directions: np.ndarray, strokes: np.ndarray, yardstick: Yardstick) -> Clusters:
+    """The Clusters of oriented points that are in order along strokes: of each stroke its stretches.
+
+    points, directions: (n, 3) unit cube, unit vectors. strokes: (n,) int, rising. yardstick: Yardstick.
+    """
+    labels, count = np.full(len(points), UNASSIGNED), 0
+    for members in np.split(np.arange(len(points)), np.flatnonzero(np.diff(strokes)) + 1):
+        for stretch in cut_stroke(points[members], yardstick) if len(members) else ():
+            labels[members[stretch]] = count
+            count += 1
+    return Clusters.of(points, directions, labels, yardstick.noise)
+
+
+def fit_strokes(clusters: Clusters, pixel: float) -> tuple[Wireframe, dict[str, int]]:
+    """The loose Wireframe of Clusters whose points are in order, and the dict kind -> number of edges.
+
+    pixel: size of a pixel at the scene, unit-cube units.
+    """
+    yardstick, fits = Yardstick(clusters.noise, pixel), []
+    for members in members_of_clusters(clusters.labels):
+        shape = shape_of_stretch(clusters.points[np.sort(members)], yardstick)
+        kind = "short" if shape is None else "loop" if shape.closed else "line" if shape.kind == "line" else "curve"
+        fits.append(ClusterFit(kind, shape))
+    return wireframe_of(fits)
 
 
 def fit_clusters(clusters: Clusters, config: "FitConfig") -> tuple[Wireframe, dict[str, int]]:

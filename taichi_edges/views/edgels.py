@@ -3,8 +3,8 @@
 Whatever detects edges gives edgels; the edge maps that the splatting learns from are drawn through them.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,24 +19,29 @@ class Edgels:
     points:    (n, 2) float32 pixels (u, v), centres at integers.
     normals:   (n, 2) float32 unit vectors across the edge, sign arbitrary.
     strengths: (n,) float32 in 0..1: how sure the detector is.
+    blurs:     (n,) float32 pixels: standard deviation of what the edge itself is blurred by in the picture, beyond what
+               a pixel blurs; 0 of a sharp one. NaN where that is not known.
     """
 
     starts: np.ndarray
     points: np.ndarray
     normals: np.ndarray
     strengths: np.ndarray
+    blurs: np.ndarray
 
     def __post_init__(self) -> None:
         count = len(self.points)
-        assert self.points.shape == self.normals.shape == (count, 2) and self.strengths.shape == (count,)
+        assert self.points.shape == self.normals.shape == (count, 2)
+        assert self.strengths.shape == self.blurs.shape == (count,)
         assert self.starts[0] == 0 and self.starts[-1] == count, self.starts
 
     @staticmethod
-    def of_views(views: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> "Edgels":
-        """From an iterable with (points, normals, strengths) for each view."""
-        columns = list(zip(*views, strict=True)) or [()] * 3
+    def of_views(views: Iterable[tuple[np.ndarray, ...]]) -> "Edgels":
+        """From an iterable with (points, normals, strengths) or (points, normals, strengths, blurs) for each view."""
+        filled = [view if len(view) == 4 else (*view, np.full(len(view[0]), np.nan)) for view in views]
+        columns = list(zip(*filled, strict=True)) or [()] * 4
         starts = np.concatenate([[0], np.cumsum([len(points) for points in columns[0]])]).astype(np.int64)
-        shapes = ((0, 2), (0, 2), (0,))
+        shapes = ((0, 2), (0, 2), (0,), (0,))
         joined = (np.concatenate([np.zeros(shape), *column]) for shape, column in zip(shapes, columns, strict=True))
         return Edgels(starts, *(np.ascontiguousarray(array, np.float32) for array in joined))
 
@@ -61,8 +66,14 @@ class Edgels:
     def keep(self, chosen: np.ndarray) -> "Edgels":
         """Only the chosen edgels. chosen: (n,) bool."""
         before = np.concatenate([[0], np.cumsum(chosen)]).astype(np.int64)
-        return Edgels(before[self.starts], self.points[chosen], self.normals[chosen], self.strengths[chosen])
+        columns = (self.points, self.normals, self.strengths, self.blurs)
+        return Edgels(before[self.starts], *(column[chosen] for column in columns))
+
+    def of_some(self, views: Sequence[int]) -> "Edgels":
+        """Those of some views, in that order."""
+        parts = [slice(self.starts[view], self.starts[view + 1]) for view in views]
+        return Edgels.of_views((*self.of_view(view), self.blurs[part]) for view, part in zip(views, parts, strict=True))
 
     def moved(self, offsets: np.ndarray) -> "Edgels":
         """The same edgels, their points moved by (n, 2) pixels."""
-        return Edgels(self.starts, (self.points + offsets).astype(np.float32), self.normals, self.strengths)
+        return replace(self, points=(self.points + offsets).astype(np.float32))

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from taichi_edges.errors import UserError, did_you_mean
-from taichi_edges.views.edgels import Edgels
 from taichi_edges.views.views import Views
 
 FEWEST_VIEWS, SHARE, MOST = 8, 10, 3  # auto: from so many views on, one in ten of them, at most three
@@ -53,5 +52,5 @@ def _some_views(views: Views, chosen: Sequence[int]) -> Views:
         edge_maps=views.edge_maps[chosen],
         intrinsics=views.intrinsics[chosen],
         world_to_camera=views.world_to_camera[chosen],
-        edgels=None if edgels is None else Edgels.of_views([edgels.of_view(view) for view in chosen]),
+        edgels=None if edgels is None else edgels.of_some(chosen),
     )

@@ -1,0 +1,37 @@
+"""How far edgels are off their edges, and the tolerances that follow from it.
+
+One estimate for everything: the residuals of the edgels about the best supported points, whatever the detector, the
+poses and the pictures make of them. All tolerances between points and edgels are so many of these standard deviations.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from taichi_edges.arrays.robust import NORMAL_MAD
+from taichi_edges.evidence.lying import EdgelsAbout
+
+if TYPE_CHECKING:
+    from taichi_edges.evidence.edgel_matching import EdgelMatching
+    from taichi_edges.evidence.viewing_planes import RefinedPoints
+
+LEAST_NOISE_PX = 0.08  # next to other edges the best detector is off by as much
+MOST_NOISE_PX = 0.5  # poses and maps that are off by more tell no two edges apart
+PROBE_PX = 1.0  # of the edgels that tell it
+BEST_SUPPORTED = 0.2  # share of the points whose edgels tell it; the others may be on no edge
+
+LIFT_NOISES = 5.0  # by which edgels of an edge may disagree: each of two is off, and the ray as well
+SCALE_NOISES = 2.5  # residual at which an edgel's weight has fallen to a quarter
+RADII_NOISES = (10.0, 8.0, 6.0)  # of the edgels looked at while points are moved to their edge, round by round
+ON_NOISES = 5.5  # within so much an edgel is an edge's
+
+
+def noise_of(matching: "EdgelMatching", placed: "RefinedPoints") -> float:
+    """Standard deviation of the edgels across their edges, px: of those about the best supported of RefinedPoints."""
+    if not len(placed):
+        return MOST_NOISE_PX
+    best = placed.keep(placed.views >= np.quantile(placed.views, 1 - BEST_SUPPORTED))
+    about = EdgelsAbout.of(matching, best.points, best.directions, PROBE_PX)
+    residuals = np.abs(about.residuals[about.there])
+    noise = NORMAL_MAD * float(np.median(residuals)) if len(residuals) else MOST_NOISE_PX
+    return float(np.clip(noise, LEAST_NOISE_PX, MOST_NOISE_PX))

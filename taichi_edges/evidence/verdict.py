@@ -1,0 +1,154 @@
+"""How likely an edge is one: a probability from what the edgels of all views say of it.
+
+Three kinds of things pass for edges. A contour of a rounded surface moves over it with the viewpoint: its edgels lie on
+one line from some directions, and beside it from others. A rounded edge stays where it is, but the pictures show it
+blurred, as a sharp one never is. And lines that chance has put between edges have few edgels, and those lie badly. Each
+says something and none says all, so the verdict is a logistic regression over the marks they leave (`MARKS`), all of
+them counts, shares, and multiples of the noise: none depends on the scene's size or units.
+
+The weights were fitted to edges whose truth is known, `benchmarks/parts.py --fit-verdict`: real CAD parts, ABC scenes
+and synthetic ones, from pictures and from drawn maps.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from taichi_edges.evidence.edge_support import Claims, EdgeSamples
+from taichi_edges.evidence.edgel_matching import EdgelMatching
+from taichi_edges.evidence.lying import EdgelsAbout, steadiness
+from taichi_edges.evidence.noise import ON_NOISES
+from taichi_edges.evidence.rounding import rounding_at
+from taichi_edges.geometry.shapes import Shape
+
+SPACING_PX = 1.0  # of the places on an edge that are looked at
+TIGHT_NOISES = 3.0  # within so much of an edge its edgels lie on it
+ABOUT_TIGHT, MOST_ABOUT_PX = 6.0, 4.0  # times that, but no more: edgels so near are about the edge
+SHOWN = 0.3  # of the places: a view that has edgels on so many shows the edge
+TOGETHER = 0.5  # share of the views that show an edge in which another one shows as well: two edges, not one that moves
+BLUR_QUANTILE = 0.75  # of the views: outlines are sharp however round the edge is
+SHARP_PX, MOST_BLUR_PX = (
+    0.25,
+    0.75,
+)  # up to the first an edge is as sharp as pictures are; beyond the second all is blurred
+ENOUGH_SPREAD = 0.5  # sine of the angle between viewing planes, 30 degrees: more says no more
+PLACES, PLACE_PX = 4, 4.0  # of an edge, where radii are tried: at most so many, so far apart at least
+MARKS = ("steadiness", "blur", "spread", "sharpness")
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Of the logistic regression: (k,) for the MARKS, and what is added."""
+
+    marks: tuple[float, ...]
+    constant: float
+
+
+FITTED = Weights((2.85, -6.47, 1.8, 5.58), -5.27)  # not chosen: see the module's first lines
+
+
+def probabilities(marks: np.ndarray, weights: Weights = FITTED) -> np.ndarray:
+    """(E,) that edges with (E, len(MARKS)) marks are edges."""
+    return 1.0 / (1.0 + np.exp(-(marks @ np.array(weights.marks) + weights.constant)))
+
+
+def marks_of(matching: EdgelMatching, shapes: Sequence[Shape], noise_px: float) -> np.ndarray:
+    """(E, len(MARKS)) what the edgels of all views say of shapes. noise_px: of the edgels.
+
+    steadiness: of the edgels about an edge the share that lies on it, those of another edge beside it left out. blur:
+    px, see `Edgels.blurs`, beyond SHARP_PX. spread: sine of the angle by which the viewing planes of its edgels lean
+    against each other. sharpness: of the views that the contour of some round surface would explain, see `rounding`,
+    the share that an edge does.
+    """
+    samples = EdgeSamples.along(shapes, SPACING_PX * matching.pixel)
+    tight = TIGHT_NOISES * noise_px
+    radius = min(ABOUT_TIGHT * tight, MOST_ABOUT_PX)
+    about = EdgelsAbout.of(matching, samples.points, samples.directions, radius)
+    owners = _owners(matching, samples, about, ON_NOISES * noise_px)
+    own = about.within(ON_NOISES * noise_px) & (owners[about.edgels] == samples.edges[:, None])
+    on = own & about.within(tight)
+    shown = samples.sums(on.astype(np.float64)) / np.maximum(np.diff(samples.starts), 1)[:, None]  # (E, V)
+    seeing = shown >= SHOWN
+    marks = np.zeros((len(shapes), len(MARKS)))
+    for number in range(len(shapes)):
+        part = samples.of(number)
+        here, lying = about.keep(part), on[part]
+        marks[number] = (
+            _steadiness(here, lying, owners, number, seeing, float(shown[number].sum())),
+            _blur(matching, here, lying, seeing[number]),
+            _spread(matching, here, lying, seeing[number]),
+            0.0,
+        )
+    marks[:, -1] = _sharpness(matching, shapes, tight)
+    return marks
+
+
+def _sharpness(matching: EdgelMatching, shapes: Sequence[Shape], tight_px: float) -> np.ndarray:
+    """(E,) see `marks_of`."""
+    counts = [int(np.clip(shape.length / (PLACE_PX * matching.pixel), 1, PLACES)) for shape in shapes]
+    middles = [(np.arange(count) + 0.5) / count for count in counts]
+    pairs = list(zip(shapes, middles, strict=True))
+    points = np.concatenate([np.zeros((0, 3)), *(shape.at(some) for shape, some in pairs)])
+    directions = np.concatenate([np.zeros((0, 3)), *(shape.tangents(some) for shape, some in pairs)])
+    found, owner = rounding_at(matching, points, directions, tight_px), np.repeat(np.arange(len(shapes)), counts)
+    sharp, rounded = (np.bincount(owner, views, len(shapes)) for views in (found.views, found.rounded))
+    return sharp / np.maximum(rounded, 1.0)
+
+
+def _owners(matching: EdgelMatching, samples: EdgeSamples, about: EdgelsAbout, on_px: float) -> np.ndarray:
+    """(e + 1,) the shape that each edgel lies on, -1 for none: of several that which more views show; last: -1.
+
+    Where an edge has no edgels of its own and lies beside one that has, it shall not share these.
+    """
+    near = about.within(on_px)
+    strength = samples.sums(about.closeness(on_px).sum(axis=1)) / np.maximum(np.diff(samples.starts), 1)
+    at, view = np.nonzero(near)
+    edges, edgels = samples.edges[at], about.edgels[at, view]
+    rank = np.empty(len(strength))
+    rank[np.argsort(-strength, kind="stable")] = np.arange(len(strength))
+    claims = Claims.of(len(matching.edgels), edgels, edges, rank[edges])
+    owners = claims.owners.copy()
+    # The next edgels along a 2D edge are the same edge's, where nobody else is on them.
+    neighbors = owners[matching.neighbors].max(axis=1, initial=-1)
+    return np.append(np.where(owners < 0, neighbors, owners), -1)
+
+
+def _steadiness(
+    about: EdgelsAbout, on: np.ndarray, owners: np.ndarray, number: int, seeing: np.ndarray, views: float
+) -> float:
+    """Of the edgels about an edge the share that lies on it, but for those of other edges that show beside it.
+
+    on: (n, V) bool. number: of the edge. seeing: (E, V) bool, which views show which edge. views: that show this one.
+    """
+    whose = owners[about.edgels[about.there & ~on]]
+    others, position = np.unique(whose, return_inverse=True)
+    mine = seeing[number]
+    together = [(mine & seeing[k]).sum() / max(mine.sum(), 1) if k not in (-1, number) else 0.0 for k in others]
+    against = 1.0 - np.clip(np.array(together) / TOGETHER, 0.0, 1.0)
+    return float(steadiness(views, views + against[position].sum() / max(len(on), 1)))
+
+
+def _blur(matching: EdgelMatching, about: EdgelsAbout, on: np.ndarray, mine: np.ndarray) -> float:
+    """Px, beyond SHARP_PX: how blurred an edge is in the views that show it, `mine`."""
+    if not mine.any():
+        return MOST_BLUR_PX - SHARP_PX
+    blurs = np.where(on[:, mine], matching.edgel_blurs[about.edgels[:, mine]], np.nan)
+    known = np.isfinite(blurs).any(axis=0)
+    if not known.any():  # ready maps do not tell
+        return 0.0
+    typical = float(np.quantile(np.nanmedian(blurs[:, known], axis=0), BLUR_QUANTILE))
+    return float(np.clip(typical - SHARP_PX, 0.0, MOST_BLUR_PX - SHARP_PX))
+
+
+def _spread(matching: EdgelMatching, about: EdgelsAbout, on: np.ndarray, mine: np.ndarray) -> float:
+    """Sine of the angle by which viewing planes of an edge lean against each other, one of each view in `mine`."""
+    if not mine.any():
+        return 0.0
+    normals = []
+    for view in np.flatnonzero(mine):
+        edgels = about.edgels[on[:, view], view]
+        normal = matching.plane_normals[edgels[len(edgels) // 2]]
+        normals.append(normal / np.linalg.norm(normal))
+    values = np.linalg.eigvalsh(np.einsum("ni,nj->ij", normals, normals))
+    return min(float(np.sqrt(max(values[1], 0.0) / max(values[2], 1e-12))), ENOUGH_SPREAD)
