@@ -28,10 +28,8 @@ ABOUT_TIGHT, MOST_ABOUT_PX = 6.0, 4.0  # times that, but no more: edgels so near
 SHOWN = 0.3  # of the places: a view that has edgels on so many shows the edge
 TOGETHER = 0.5  # share of the views that show an edge in which another one shows as well: two edges, not one that moves
 BLUR_QUANTILE = 0.75  # of the views: outlines are sharp however round the edge is
-SHARP_PX, MOST_BLUR_PX = (
-    0.25,
-    0.75,
-)  # up to the first an edge is as sharp as pictures are; beyond the second all is blurred
+SHARP_PX = 0.25  # up to so much edges are as sharp as pictures are
+MOST_BLUR_PX = 0.75  # more says no more
 ENOUGH_SPREAD = 0.5  # sine of the angle between viewing planes, 30 degrees: more says no more
 PLACES, PLACE_PX = 4, 4.0  # of an edge, where radii are tried: at most so many, so far apart at least
 MARKS = ("steadiness", "blur", "spread", "sharpness")

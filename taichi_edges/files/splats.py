@@ -39,9 +39,9 @@ def write_gaussians(
     normals = np.zeros((count, 3), np.float32)
     colours = np.tile((np.array(SPLAT_RGB) - 0.5) / HARMONIC_0, (count, 1))
     opacity_column = np.reshape(opacity_logits, (count, 1))
-    columns, fields = [means, normals, colours, opacity_column, log_scales, quaternions], FIELDS
+    columns, fields = [means, normals, colours, opacity_column, log_scales, quaternions], list(FIELDS)
     if strokes is not None:
-        columns, fields = [*columns, np.reshape(strokes, (count, 1))], FIELDS + STROKE_FIELDS
+        columns, fields = [*columns, np.reshape(strokes, (count, 1))], [*FIELDS, *STROKE_FIELDS]
     values = np.concatenate(columns, axis=1)
     rounding = np.abs(np.asarray(means, np.float64) - np.asarray(means, np.float32)).max(initial=0.0)
     wide = rounding > ROUNDED * np.exp(np.min(log_scales, initial=np.inf))
@@ -60,11 +60,12 @@ def read_gaussians(path: Path | str) -> tuple[np.ndarray, np.ndarray, np.ndarray
     wanted = (MEAN_FIELDS, SCALE_FIELDS, ROTATION_FIELDS, OPACITY_FIELDS)
     vertices = read_vertices(path, [name for names in wanted for name in names])
     means, log_scales, quaternions, opacities = (stack_fields(vertices, names) for names in wanted)
-    others = (array.astype(np.float32, copy=False) for array in (log_scales, quaternions, opacities[:, 0]))
-    return (means, *others)
+    scales, turns, logits = (array.astype(np.float32, copy=False) for array in (log_scales, quaternions, opacities))
+    return means, scales, turns, logits[:, 0]
 
 
 def read_strokes(path: Path | str) -> np.ndarray | None:
     """(n,) int of a Gaussian Splatting PLY: the stroke along which each was laid; None where they were not."""
     vertices = read_vertices(path, MEAN_FIELDS)
-    return vertices[STROKE_FIELDS[0]].astype(np.int64) if STROKE_FIELDS[0] in vertices.dtype.names else None
+    (name,) = STROKE_FIELDS
+    return vertices[name].astype(np.int64) if name in (vertices.dtype.names or ()) else None

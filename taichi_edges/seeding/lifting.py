@@ -2,13 +2,13 @@
 
 An edgel with its camera spans a plane, and so does each edgel of another view that the viewing ray of the first can
 meet: the two planes intersect in a line, which is where the edge would be if both were pictures of it. Of wrong pairs
-these lines are anywhere along the ray; those of right ones coincide, within what the detector is off. So each edgel asks
-every view that looks from elsewhere, and the depths at which most of them agree are its candidates. How much an
+these lines are anywhere along the ray; those of right ones coincide, within what the detector is off. So each edgel
+asks every view that looks from elsewhere, and the depths at which most of them agree are its candidates. How much an
 agreement says is a matter of chance: a view with many edges, or one in whose picture the depth hardly shows, agrees
 with anything.
 
-No threshold on a share of the views: an edge on one face, in sight of a tenth of the views, stands out as clearly on its
-own ray as the outline of the whole does on another.
+No threshold on a share of the views: an edge on one face, in sight of a tenth of the views, stands out as clearly on
+its own ray as the outline of the whole does on another.
 """
 
 from dataclasses import dataclass
@@ -40,6 +40,7 @@ TURNED_BY_CHANCE = 0.2  # share of all directions within that
 WRONG = 0.02  # share of agreements that are of other edges however clear they look: what one view can say at most
 LEAST_PARALLAX = 0.15  # of the largest on a ray: what tells less of the depth is no candidate itself
 APART_PX = 1.5  # candidates of one edgel are so far apart, in the view that tells their depths best
+FEW = 0.02  # share of the rays that may pass nearer to the other camera than the reach is made for
 LANES = 512  # Taichi gives a CPU thread so many items of a loop at least
 
 
@@ -86,11 +87,11 @@ def lift_rays(
     """The best inverse depths on each viewing ray of one view.
 
     rays: (n, 3), depth 1. normals: (n, 3) unit, of the viewing planes. ranges: (n, 2) inverse depths. centre: (3,) of
-    the camera. angles: (m, n) of the rays about the line to each of m other cameras, whose views are `others`. Of these,
-    starts: (m + 1,) where the edgels of each begin in `order`, indices in the order of their angles `around`; reach: (m,)
-    radians. planes: (e, 4), edgels: (e, 4) of all views; cameras: (V, 3, 4). depths, slopes, turns, scores, whose:
-    (workers, MOST_MEETINGS) scratch. found: (n, 4 CANDIDATES) inverse depth, angle in the viewing plane, evidence and
-    parallax of each.
+    the camera. angles: (m, n) of the rays about the line to each of m other cameras, whose views are `others`. Of
+    these, starts: (m + 1,) where the edgels of each begin in `order`, indices in the order of their angles `around`;
+    reach: (m,) radians. planes: (e, 4), edgels: (e, 4) of all views; cameras: (V, 3, 4). depths, slopes, turns, scores,
+    whose: (workers, MOST_MEETINGS) scratch. found: (n, 4 CANDIDATES) inverse depth, angle in the viewing plane,
+    evidence and parallax of each.
     """
     for item in range(workers * lanes):
         if item % lanes == 0:
@@ -295,10 +296,10 @@ def _lift_view(
     near, far = through_box(eye, directions, grown)
     near = np.maximum(near, SWEPT_FROM)
     meets = far > near
-    ranges = np.where(
-        meets[:, None], 1.0 / np.column_stack([np.where(meets, far, 1.0), np.where(meets, near, 1.0)]), 0.0
-    )
-    ranges[~meets, 0] = 1.0  # no inverse depth lies between 1 and 0
+    nowhere = np.array([[1.0, 0.0]])  # no inverse depth lies between these
+    depths = np.where(meets[:, None], np.column_stack([far, near]), 1.0)
+    ranges = np.where(meets[:, None], 1.0 / depths, nowhere)
+    assert views.edgels is not None
     angles, order, around, reach = [], [], [], []
     bounds, middle = views.edgels.starts, views.box.mean(axis=0)
     for other in others:
@@ -350,13 +351,10 @@ class _AnglesAbout:
         self.up = np.cross(base, self.side)
 
     def of(self, directions: np.ndarray) -> tuple[np.ndarray, float]:
-        """(n,) radians, of (n, 3) rays of either camera; and how far from the line nearly all of them are at depth 1."""
+        """(n,) radians, of (n, 3) rays of either camera; and how far from the line nearly all are at depth 1."""
         along, across = directions @ self.side, directions @ self.up
         wide = float(np.quantile(np.hypot(along, across), FEW)) if len(directions) else 1.0
         return np.arctan2(across, along), wide
-
-
-FEW = 0.02  # share of the rays that may pass nearer to the other camera than the reach is made for
 
 
 def _in_space(own: np.ndarray, rays: Rays, found: np.ndarray) -> Lifted:

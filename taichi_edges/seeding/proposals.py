@@ -2,7 +2,7 @@
 
 Every view proposes the edges it sees, so an edge is proposed as often as it is seen, more or less exactly, and some
 proposals are mistakes that other edges have suggested. The one with the most support takes the edgels that lie on it,
-in all views; the next one counts what is left. What remains of a stroke where others have taken its edgels is no stroke.
+in all views; the next one counts what is left. Where others have taken its edgels, a stroke is none.
 """
 
 import heapq

@@ -42,7 +42,7 @@ class Strokes(Columns):
 
 
 def traced(views: Views, lifted: Lifted, paths: Sequence[np.ndarray], tolerance: float) -> Strokes:
-    """Strokes along paths of edgels. lifted: their candidates. paths: index arrays. tolerance: px, as they were lifted."""
+    """Strokes along paths of edgels. lifted: their candidates. paths: index arrays. tolerance: px, of the lifting."""
     states = best_states(views, lifted, paths, tolerance)
     edgels, chosen, numbers, count = [], [], [], 0
     for path, (state, goes_on) in zip(paths, states, strict=True):

@@ -5,6 +5,8 @@ to the line or cubic of each stretch in units of the noise, and for every parame
 observations (BIC, `fitting/model_selection.py`).
 """
 
+from itertools import pairwise
+
 import numpy as np
 
 from taichi_edges.fitting.model_selection import Track, Yardstick, best_shape
@@ -39,7 +41,7 @@ def cut_stroke(points: np.ndarray, yardstick: Yardstick) -> list[slice]:
     while path[-1]:
         path.append(int(came_from[path[-1]]))
     bounds = stations[path[::-1]]
-    return [slice(int(first), int(last)) for first, last in zip(bounds[:-1], bounds[1:], strict=True)]
+    return [slice(int(first), int(last)) for first, last in pairwise(bounds.tolist())]
 
 
 def step_length(points: np.ndarray) -> float:
