@@ -34,7 +34,7 @@ def evaluate(run: "Run") -> dict[str, Any]:
 
     edges = read_edges(run.path("edges.json"))
     views, held_out = read_views(run.path("views.npz")), read_views(run.path("held_out.npz"))
-    unit, truth = edges.transformed(views.similarity.to_unit), _ground_truth(run, views, held_out)
+    unit, truth = edges.transformed(views.similarity.to_unit), ground_truth_of(run, views, held_out)
     if truth is None:
         scores = measure_alone(unit)
     else:
@@ -57,9 +57,9 @@ def warn_of_chance(metrics: Mapping[str, float | None], progress: "Progress") ->
         progress.warn(f"{problem}: {WRONG_CAMERAS}")
 
 
-def _ground_truth(run: "Run", views: Views, held_out: Views) -> "GroundTruth | None":
+def ground_truth_of(run: "Run", views: Views, held_out: Views) -> "GroundTruth | None":
     """The GroundTruth of the scene, or None. views, held_out: Views that found its edges, and the others."""
-    from taichi_edges.evaluation.ground_truth import read_ground_truth, read_sampled_ply
+    from taichi_edges.evaluation.ground_truth import read_sampled_ply
     from taichi_edges.evaluation.pseudo_truth import Votes, points_in_box, pseudo_truth
 
     path, config, from_truth = truth_path(run), run.config.evaluation, np.linalg.inv(views.input_to_truth)

@@ -99,39 +99,42 @@ def offsets_around(
 
 
 @ti.kernel
-def try_radii(size: ti.i32, blocks: ti.i32, offsets: F32_3D, angles: F32_2D, tight: ti.f32, best: F32_2D):
-    """best (n, 3): how many views have an edgel on the place; the most that a radius explains; that radius, px."""
-    for block in range(blocks):
-        for i in range(block * size, ti.min((block + 1) * size, offsets.shape[0])):
-            sharp = 0
-            for view in range(offsets.shape[1]):
-                if is_there(offsets, i, view, 0.0, tight):
-                    sharp += 1
-            most, winner = sharp, 0.0
+def try_radii(offsets: F32_3D, angles: F32_2D, tight: ti.f32, moves: F32_2D, best: F32_2D):
+    """best (n, 3): how many views have an edgel on the place; the most that a radius explains; that radius, px.
+
+    moves: (n, V) scratch.
+    """
+    for i in range(offsets.shape[0]):
+        sharp, any_edgel = 0, 0
+        for view in range(offsets.shape[1]):
+            sharp += 1 if is_there(offsets, i, view, 0.0, tight) else 0
+            any_edgel += 1 if offsets[i, view, 0] < UNKNOWN else 0
+        most, winner = sharp, 0.0
+        if any_edgel > sharp:
             for turn in range(DIRECTIONS):
+                for view in range(offsets.shape[1]):
+                    cosine = ti.cos(angles[i, view] - turn * (2.0 * np.pi / DIRECTIONS))
+                    # From the other side it is the contour as well, and moves the other way.
+                    moves[i, view] = 1.0 - cosine if cosine > 0 else -1.0 - cosine
                 radius = LEAST_RADIUS_PX
                 for _ in range(RADII):
                     inwards, outwards = 0, 0
                     for view in range(offsets.shape[1]):
-                        if offsets[i, view, 0] < UNKNOWN:
-                            cosine = ti.cos(angles[i, view] - turn * (2.0 * np.pi / DIRECTIONS))
-                            # From the other side it is the contour as well, and moves the other way.
-                            moved = radius * (1.0 - cosine) if cosine > 0 else -radius * (1.0 + cosine)
-                            if is_there(offsets, i, view, moved, tight):
-                                outwards += 1
-                            if is_there(offsets, i, view, -moved, tight):
-                                inwards += 1
+                        if offsets[i, view, 0] < UNKNOWN and ti.abs(radius * moves[i, view]) < 2.0 * AROUND_PX:
+                            moved = radius * moves[i, view]
+                            outwards += 1 if is_there(offsets, i, view, moved, tight) else 0
+                            inwards += 1 if is_there(offsets, i, view, -moved, tight) else 0
                     if ti.max(inwards, outwards) > most:
                         most, winner = ti.max(inwards, outwards), radius
                     radius *= RADIUS_STEP
-            best[i, 0], best[i, 1], best[i, 2] = sharp, most, winner
+        best[i, 0], best[i, 1], best[i, 2] = sharp, most, winner
 
 
 @ti.func
 def is_there(offsets: ti.template(), i, view, moved, tight):
     """Whether a view has an edgel where the contour would have moved to."""
     found = False
-    for k in range(MOST_AROUND):
+    for k in ti.static(range(MOST_AROUND)):
         if ti.abs(offsets[i, view, k] - moved) <= tight + GROWING * ti.abs(moved):
             found = True
     return found
@@ -153,6 +156,7 @@ def rounding_at(matching: EdgelMatching, points: np.ndarray, directions: np.ndar
     offsets, angles = download(offsets), download(angles)
     best = upload(np.zeros((count, 3), np.float32))
     if count:
-        try_radii(*blocks_of(places), upload(offsets), upload(angles), tight_px, best)
+        moves = upload(np.zeros((count, views), np.float32))
+        try_radii(upload(offsets), upload(angles), tight_px, moves, best)
     sharp, best, radius = download(best).T.astype(np.float64)
     return Rounding(sharp, best, np.abs(radius))

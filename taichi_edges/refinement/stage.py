@@ -41,6 +41,7 @@ WIDE_GAP_PX = 24.0  # between strokes that continue each other, where their ends
 MOST_COMPARED = 150  # edges whose relations are counted where nobody asked for them: there are as many as its square
 LEAST_CONFIDENCE = 0.2  # of an edge, see `edge_support.evidence_of`
 LENIENT = 0.75  # of the steadiness, for edges that have not been adjusted
+HOPELESS = 0.1  # of the least confidence, for strokes: pieces of an edge are less sure than all of it
 DOUBTED = 0.3  # of the least confidence, for the same: ends that are not in place yet tell against an edge
 LEAST_SUPPORTED = 0.33  # of the length of an edge; where edges touch, only one of them owns the edgels
 
@@ -91,11 +92,13 @@ def whole_edges(
     Free ends are extended only when it is known which are free, and then some more strokes continue each other.
     """
     yardstick, seen = yardstick_of(shapes, matching), partial(support_along, matching)
-    shapes, first = continued(shapes, yardstick, seen)
+    likely = not_hopeless(matching, shapes, config)
+    hopeless = len(shapes) - len(likely)
+    shapes, first = continued(likely, yardstick, seen)
     kept = with_support(matching, shapes, config)
     longer, second = continued(with_longer_ends(matching, kept), yardstick, seen, WIDE_GAP_PX)
     found = with_support(matching, longer, config)
-    unsupported = len(shapes) - len(kept) + len(longer) - len(found)
+    unsupported = hopeless + len(shapes) - len(kept) + len(longer) - len(found)
     return found, RefineCounts(**asdict(first + second), unsupported=unsupported)
 
 
@@ -132,6 +135,14 @@ def with_evidence(wireframe: Wireframe, matching: EdgelMatching, config: "Refine
 def edgel_noise(support: Support) -> float:
     """Standard deviation of the edgels of a Support across their edges, px."""
     return float(np.clip(support.noise_px, LEAST_NOISE_PX, MOST_NOISE_PX))
+
+
+def not_hopeless(matching: EdgelMatching, shapes: Sequence[Shape], config: "RefineConfig") -> list[Shape]:
+    """The strokes that may be part of an edge: what hardly can would lead others astray, and takes time."""
+    if not config.verdict or not len(shapes):
+        return list(shapes)
+    likely = probabilities(marks_of(matching, shapes, edgel_noise(support_of(matching, shapes))))
+    return [shape for shape, p in zip(shapes, likely, strict=True) if p >= HOPELESS * config.min_confidence]
 
 
 def with_support(matching: EdgelMatching, shapes: Sequence[Shape], config: "RefineConfig") -> list[Shape]:

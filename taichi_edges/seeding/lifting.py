@@ -82,6 +82,8 @@ def lift_rays(
     turns: F32_2D,
     scores: F32_2D,
     whose: I32_2D,
+    meetings: I32_2D,
+    rising: I32_2D,
     found: F32_2D,
 ):
     """The best inverse depths on each viewing ray of one view.
@@ -90,8 +92,8 @@ def lift_rays(
     the camera. angles: (m, n) of the rays about the line to each of m other cameras, whose views are `others`. Of
     these, starts: (m + 1,) where the edgels of each begin in `order`, indices in the order of their angles `around`;
     reach: (m,) radians. planes: (e, 4), edgels: (e, 4) of all views; cameras: (V, 3, 4). depths, slopes, turns, scores,
-    whose: (workers, MOST_MEETINGS) scratch. found: (n, 4 CANDIDATES) inverse depth, angle in the viewing plane,
-    evidence and parallax of each.
+    whose, meetings, rising: (workers, MOST_MEETINGS) scratch. found: (n, 4 CANDIDATES) inverse depth, angle in the
+    viewing plane, evidence and parallax of each.
     """
     for item in range(workers * lanes):
         if item % lanes == 0:
@@ -105,6 +107,7 @@ def lift_rays(
                 second = normal.cross(first)
                 count = 0
                 for m in range(others.shape[0]):
+                    meetings[worker, m] = 0
                     at = first_from(around, starts[m], starts[m + 1], angles[m, i] - reach[m])
                     while at < starts[m + 1] and around[at] <= angles[m, i] + reach[m] and count < MOST_MEETINGS:
                         e = order[at]
@@ -121,16 +124,21 @@ def lift_rays(
                                     slopes[worker, count] = ti.abs(offset / h[2])
                                     turns[worker, count] = ti.atan2(line.dot(second), line.dot(first))
                                     whose[worker, count] = m
+                                    meetings[worker, m] += 1
                                     count += 1
                         at += 1
                 most = 0.0
                 for k in range(count):
                     most = ti.max(most, slopes[worker, k])
                 span = ranges[i, 1] - ranges[i, 0]
+                telling = sort_telling(worker, count, LEAST_PARALLAX * most, depths, slopes, rising)
+                reached = tolerance / ti.max(LEAST_PARALLAX * most, 1e-12)
                 for k in range(count):
                     scores[worker, k] = 0.0
-                    if slopes[worker, k] >= LEAST_PARALLAX * most:
-                        scores[worker, k] = evidence_at(worker, k, count, span, tolerance, depths, slopes, turns, whose)
+                for at in range(telling):
+                    scores[worker, rising[worker, at]] = evidence_at(
+                        worker, at, telling, span, tolerance, reached, depths, slopes, turns, whose, meetings, rising
+                    )
                 for c in range(CANDIDATES):
                     best, which = 0.0, -1
                     for k in range(count):
@@ -173,35 +181,75 @@ def homogeneous(cameras: ti.template(), view, point):
 
 
 @ti.func
+def sort_telling(worker, count, least, depths: ti.template(), slopes: ti.template(), rising: ti.template()):
+    """How many of the meetings tell the depth, with a slope of at least `least`; `rising` their indices by depth.
+
+    Shell's sort: insertion sort at a distance of 40, 13, 4 and 1.
+    """
+    telling = 0
+    for k in range(count):
+        if slopes[worker, k] >= least:
+            rising[worker, telling] = k
+            telling += 1
+    gap = 40
+    while gap > 0:
+        for at in range(gap, telling):
+            k = rising[worker, at]
+            depth, to = depths[worker, k], at
+            while to >= gap and depths[worker, rising[worker, to - gap]] > depth:
+                rising[worker, to] = rising[worker, to - gap]
+                to -= gap
+            rising[worker, to] = k
+        gap //= 3
+    return telling
+
+
+@ti.func
 def evidence_at(
     worker,
-    k,
-    count,
+    at,
+    telling,
     span,
     tolerance,
+    reached,
     depths: ti.template(),
     slopes: ti.template(),
     turns: ti.template(),
     whose: ti.template(),
+    meetings: ti.template(),
+    rising: ti.template(),
 ):
-    """Log likelihood ratio that the edge is at the k-th meeting: what each view says that has one there, too.
+    """Log likelihood ratio that the edge is at a meeting: what each view says that has one there, too.
 
-    The meetings of a view follow each other.
+    at: of the `telling` meetings in the order of their depths; those farther than `reached` are out of tolerance. A
+    view counts once, by the nearest of its meetings that runs the same way.
     """
-    total, other = 0.0, 0
-    while other < count:
-        view, meetings, closest, slope = whose[worker, other], 0, 0.0, 1.0
-        while other < count and whose[worker, other] == view:
-            off = ti.abs(depths[worker, other] - depths[worker, k]) * slopes[worker, other]
-            if off < tolerance and ti.abs(ti.sin(turns[worker, other] - turns[worker, k])) < TURNED_SINE:
-                close = 1.0 - (off / tolerance) ** 2
-                if close > closest:
-                    closest, slope = close, slopes[worker, other]
-            meetings += 1
-            other += 1
-        if closest > 0.0:
-            chance = ti.min(1.0, meetings * 2.0 * tolerance / (slope * span))
-            total += closest * -ti.log(TURNED_BY_CHANCE * chance + WRONG)
+    own = rising[worker, at]
+    total, seen = 0.0, ti.u64(0)
+    below, above = at - 1, at
+    while True:
+        down, up = 2.0 * reached, 2.0 * reached
+        if below >= 0:
+            down = depths[worker, own] - depths[worker, rising[worker, below]]
+        if above < telling:
+            up = depths[worker, rising[worker, above]] - depths[worker, own]
+        apart = ti.min(down, up)
+        if apart > reached:
+            break
+        k = 0
+        if up <= down:
+            k = rising[worker, above]
+            above += 1
+        else:
+            k = rising[worker, below]
+            below -= 1
+        off, bit = apart * slopes[worker, k], ti.u64(1) << ti.cast(whose[worker, k], ti.u64)
+        turned_by = ti.abs(ti.sin(turns[worker, k] - turns[worker, own]))
+        if off < tolerance and (seen & bit) == 0 and turned_by < TURNED_SINE:
+            seen |= bit
+            expected = meetings[worker, whose[worker, k]] * 2.0 * tolerance / (slopes[worker, k] * span)
+            close = 1.0 - (off / tolerance) ** 2
+            total += close * -ti.log(TURNED_BY_CHANCE * ti.min(1.0, expected) + WRONG)
     return total
 
 
@@ -315,7 +363,7 @@ def _lift_view(
     on_cpu = ti.lang.impl.current_cfg().arch == ti.cpu
     workers, lanes = (threads(), LANES) if on_cpu else (len(own), 1)
     scratch = [upload(np.zeros((workers, MOST_MEETINGS), np.float32)) for _ in range(4)]
-    scratch.append(upload(np.zeros((workers, MOST_MEETINGS), np.int32)))
+    scratch += [upload(np.zeros((workers, MOST_MEETINGS), np.int32)) for _ in range(3)]
     normals = rays.planes[own, :3]
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     floats = [directions, normals, ranges, eye, np.array(angles)]
