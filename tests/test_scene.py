@@ -133,9 +133,7 @@ def test_an_unknown_key_like_no_other_lists_the_known_ones(scene):
 
 def test_a_key_that_is_gone_says_what_to_do(scene):
     path = scene("filter: {grow_step: 0.5}")
-    assert (
-        refusal(path) == f"{path}: filter.grow_step: unknown key; it is gone, for growing goes by a pixel; leave it out"
-    )
+    assert refusal(path) == f"{path}: filter.grow_step: unknown key; it is gone, and growing with it; leave it out"
 
 
 def test_all_mistakes_are_counted(scene):

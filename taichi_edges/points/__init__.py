@@ -1,1 +1,1 @@
-"""Which trained points to trust, and those that continue them."""
+"""Which trained points to trust, and where they belong."""

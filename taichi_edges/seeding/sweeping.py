@@ -1,9 +1,10 @@
 """Seeds by sweeping: along the viewing ray of an edgel, the depths at which other views see an edge of one direction.
 
-Where views are many and edges few, places where many views show any edge are edges (`voting`). In photographs of a
-building a tenth of all pixels lies beside an edgel, a place is in sight of a few views, and such places are everywhere.
-What tells them apart is the direction: the edgel and that of another view each span a plane with their camera, the
-planes meet in a line, and that line must be the same for the other views (Fabbri and Kimia, "3D Curve Sketch", 2010).
+Where views are many and edges few, every edgel is lifted, against all views around (`lifting`). In photographs of a
+building a tenth of all pixels lies beside an edgel, and a place is in sight of a few views: places where several of
+them show some edge are everywhere. What tells them apart is the direction: the edgel and that of another view each span
+a plane with their camera, the planes meet in a line, and that line must be the same for the other views (Fabbri and
+Kimia, "3D Curve Sketch", 2010).
 And edges are long: the places that the edgels of one edge find lie along a line, those found by chance do not.
 """
 

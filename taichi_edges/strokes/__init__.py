@@ -1,1 +1,1 @@
-"""From oriented points to single edges. NumPy in, NumPy out; `contours` alone asks the images."""
+"""From oriented points to single edges. NumPy in, NumPy out; the images are not asked."""
