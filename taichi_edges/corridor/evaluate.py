@@ -59,7 +59,7 @@ def warn_of_chance(metrics: Mapping[str, float | None], progress: "Progress") ->
 
 def ground_truth_of(run: "Run", views: Views, held_out: Views) -> "GroundTruth | None":
     """The GroundTruth of the scene, or None. views, held_out: Views that found its edges, and the others."""
-    from taichi_edges.evaluation.ground_truth import read_sampled_ply
+    from taichi_edges.evaluation.ground_truth import read_ground_truth, read_sampled_ply
     from taichi_edges.evaluation.pseudo_truth import Votes, points_in_box, pseudo_truth
 
     path, config, from_truth = truth_path(run), run.config.evaluation, np.linalg.inv(views.input_to_truth)
