@@ -60,6 +60,13 @@ class EdgeSamples:
             np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         )
 
+    @staticmethod
+    def of_points(points: np.ndarray, directions: np.ndarray, edges: np.ndarray, spacing: float) -> "EdgeSamples":
+        """Of (n, 3) points with (n, 3) directions on edges 0 .. E - 1, (n,) rising: samples `spacing` apart."""
+        counts = np.bincount(edges) if len(edges) else np.zeros(0, np.int64)
+        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        return EdgeSamples(points, directions, edges, np.zeros(len(points)), np.full(len(points), spacing), starts)
+
     def __len__(self) -> int:
         return len(self.points)
 

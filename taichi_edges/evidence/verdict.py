@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taichi_edges.arrays.ranges import ragged
 from taichi_edges.evidence.edge_support import Claims, EdgeSamples
 from taichi_edges.evidence.edgel_matching import EdgelMatching
 from taichi_edges.evidence.lying import EdgelsAbout, steadiness
@@ -59,8 +60,12 @@ def marks_of(matching: EdgelMatching, shapes: Sequence[Shape], noise_px: float) 
     against each other. sharpness: of the views that the contour of some round surface would explain, see `rounding`,
     the share that an edge does.
     """
-    samples = EdgeSamples.along(shapes, SPACING_PX * matching.pixel)
-    tight = TIGHT_NOISES * noise_px
+    return marks_along(matching, EdgeSamples.along(shapes, SPACING_PX * matching.pixel), noise_px)
+
+
+def marks_along(matching: EdgelMatching, samples: EdgeSamples, noise_px: float) -> np.ndarray:
+    """`marks_of` the edges that EdgeSamples lie along, about SPACING_PX apart."""
+    count, tight = len(samples.starts) - 1, TIGHT_NOISES * noise_px
     radius = min(ABOUT_TIGHT * tight, MOST_ABOUT_PX)
     about = EdgelsAbout.of(matching, samples.points, samples.directions, radius)
     owners = _owners(matching, samples, about, ON_NOISES * noise_px)
@@ -68,8 +73,8 @@ def marks_of(matching: EdgelMatching, shapes: Sequence[Shape], noise_px: float) 
     on = own & about.within(tight)
     shown = samples.sums(on.astype(np.float64)) / np.maximum(np.diff(samples.starts), 1)[:, None]  # (E, V)
     seeing = shown >= SHOWN
-    marks = np.zeros((len(shapes), len(MARKS)))
-    for number in range(len(shapes)):
+    marks = np.zeros((count, len(MARKS)))
+    for number in range(count):
         part = samples.of(number)
         here, lying = about.keep(part), on[part]
         marks[number] = (
@@ -78,19 +83,18 @@ def marks_of(matching: EdgelMatching, shapes: Sequence[Shape], noise_px: float) 
             _spread(matching, here, lying, seeing[number]),
             0.0,
         )
-    marks[:, -1] = _sharpness(matching, shapes, tight)
+    marks[:, -1] = _sharpness(matching, samples, tight)
     return marks
 
 
-def _sharpness(matching: EdgelMatching, shapes: Sequence[Shape], tight_px: float) -> np.ndarray:
-    """(E,) see `marks_of`."""
-    counts = [int(np.clip(shape.length / (PLACE_PX * matching.pixel), 1, PLACES)) for shape in shapes]
-    middles = [(np.arange(count) + 0.5) / count for count in counts]
-    pairs = list(zip(shapes, middles, strict=True))
-    points = np.concatenate([np.zeros((0, 3)), *(shape.at(some) for shape, some in pairs)])
-    directions = np.concatenate([np.zeros((0, 3)), *(shape.tangents(some) for shape, some in pairs)])
-    found, owner = rounding_at(matching, points, directions, tight_px), np.repeat(np.arange(len(shapes)), counts)
-    sharp, rounded = (np.bincount(owner, views, len(shapes)) for views in (found.views, found.rounded))
+def _sharpness(matching: EdgelMatching, samples: EdgeSamples, tight_px: float) -> np.ndarray:
+    """(E,) see `marks_of`, at places in the middles of equal parts of each edge."""
+    lengths = np.diff(samples.starts)
+    counts = np.clip((lengths * SPACING_PX / PLACE_PX).astype(int), 1, PLACES)
+    edge, place = ragged(np.where(lengths > 0, counts, 0))
+    chosen = samples.starts[edge] + ((place + 0.5) * lengths[edge] / counts[edge]).astype(int)
+    found = rounding_at(matching, samples.points[chosen], samples.directions[chosen], tight_px)
+    sharp, rounded = (np.bincount(edge, views, len(lengths)) for views in (found.views, found.rounded))
     return sharp / np.maximum(rounded, 1.0)
 
 
