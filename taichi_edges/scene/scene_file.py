@@ -115,7 +115,14 @@ _WORDS = {
 
 # Keys that a scene does not have any more, or never had, and what to do instead.
 _NO_KEYS = {
-    "filter.grow_step": "it is gone, for growing goes by a pixel; leave it out",
+    **dict.fromkeys(
+        ("filter.grow", "filter.grow_step", "filter.harvest"),
+        "it is gone, for the strokes of train.seeds: lift reach the ends of their edges; leave it out",
+    ),
+    **dict.fromkeys(
+        ("filter.min_steadiness", "filter.min_evidence", "filter.min_angle"),
+        "it is gone, for refine.verdict tells edges from what is none; leave it out",
+    ),
     "stage": "the stage to start with is --stage on the command line, the argument start from Python",
     "show": "the window is opened by the command line alone, with --show",
 }
