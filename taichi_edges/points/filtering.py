@@ -27,7 +27,7 @@ ROUNDS = 2  # what others explained that are gone by then is looked at again
 
 @dataclass(frozen=True)
 class FilterCounts:
-    """How many Gaussians came in, how many points each filter took away, and how many were found beyond them."""
+    """How many Gaussians came in, and how many points each filter took away."""
 
     gaussians: int
     low_opacity: int
