@@ -44,10 +44,21 @@ def test_edgels_keep_their_views():
     assert len(Edgels.of_views([])) == 0
 
 
-def test_edgels_survive_the_disk(tmp_path, generator):
-    views = views_of([A], generator, count=3)
+def test_edgels_know_their_blur_where_the_detector_tells_it():
+    none, known = [(np.ones((2, 2)), np.ones((2, 2)), np.ones(2))], (np.ones((1, 2)), np.ones((1, 2)), np.ones(1))
+    edgels = Edgels.of_views([*none, (*known, np.array([0.5]))])
+    np.testing.assert_array_equal(edgels.blurs, np.array([np.nan, np.nan, 0.5], np.float32))
+    assert edgels.keep(np.array([False, True, True])).blurs[1] == 0.5
+    some = edgels.of_some([1, 0, 1])
+    assert some.starts.tolist() == [0, 1, 3, 4]
+    np.testing.assert_array_equal(some.blurs, np.array([0.5, np.nan, np.nan, 0.5], np.float32))
+
+
+@pytest.mark.parametrize("blur", [None, 0.7])
+def test_edgels_survive_the_disk(tmp_path, generator, blur):
+    views = views_of([A], generator, count=3, blur=blur)
     again = read_views(write_views(tmp_path / "views.npz", views))
-    for name in ("starts", "points", "normals", "strengths"):
+    for name in ("starts", "points", "normals", "strengths", "blurs"):
         np.testing.assert_array_equal(getattr(again.edgels, name), getattr(views.edgels, name))
     assert read_views(write_views(tmp_path / "blank.npz", blank_views(2))).edgels is None
 
