@@ -1,7 +1,8 @@
 """What every step after the training is worth: `python benchmarks/wireframe.py [SCENE ...]`; with --hard, hard parts.
 
 A scene is prepared and trained once, into a folder of its own below --out; the steps after that are done anew, in this
-process. Each row of a table adds one step to the row before.
+process. Each row of a table adds one step to the row before; `strokes` starts anew, from the order that the Gaussians
+were laid in.
 """
 
 import argparse
@@ -59,16 +60,11 @@ WORST = {"exact p95 mm": ("exact_p95_mm", "{:.2f}")}
 
 
 def trained_points(run):
-    """Points (n, 3) and directions (n, 3): the trained centres that pass the paper's filters, in the unit cube."""
-    cluster.cluster(with_filter(run, refine=False))
+    """Points (n, 3) and directions (n, 3), unit cube: the trained centres that pass the paper's filters, unordered."""
+    section = run.config.filter.model_copy(update={"refine": False})
+    cluster.cluster(replace(run, config=run.config.model_copy(update={"filter": section})))
     clusters = read_clusters(run.path("clusters.npz"))
     return clusters.points, clusters.directions
-
-
-def with_filter(run, **settings):
-    """The Run with other settings of the scene's `filter` section."""
-    section = run.config.filter.model_copy(update=settings)
-    return replace(run, config=run.config.model_copy(update={"filter": section}))
 
 
 def traversed(run):
@@ -95,17 +91,12 @@ def fitted(run, points, directions):
     return fit_clusters(assemble(points, directions, run.config.cluster), run.config.fit)[0]
 
 
-def filtered(run, **settings):
-    """The edges of the stages `cluster` and `fit` with some settings of the scene's `filter` section."""
-    cluster.cluster(with_filter(run, **settings))
+def strokes(run):
+    """The edges of the stages `cluster` and `fit`: each stroke cut into stretches, the best shape for each of these."""
+    cluster.cluster(run)
     fit.fit(run)
     views = read_views(run.path("views.npz"))
     return read_wireframe(run.path("edges_fit.json")).transformed(views.similarity.to_unit, views.similarity.scale)
-
-
-explained = partial(filtered, refine=True, grow=0.0, harvest=False)
-grown = partial(filtered, refine=True, harvest=False)
-harvested = partial(filtered, refine=True, harvest=True)
 
 
 # From these to a wireframe: functions of a loose Wireframe, the Views, and the scene's `refine` section --------------
@@ -153,13 +144,11 @@ STEPS = (
     Step("as trained, graph traversal", traversed),
     Step("+ whole lines and arcs", claimed),
     Step("+ viewing planes", on_viewing_planes),
-    Step("+ explaining away", explained),
-    Step("+ growing", grown),
-    Step("+ merging", grown, merged),
-    Step("+ extents", grown, extended),
-    Step("+ shared vertices", grown, joined),
-    Step("+ joint adjustment", grown, refined),
-    Step("+ harvest: the default", harvested, refined),
+    Step("strokes", strokes),
+    Step("+ merging", strokes, merged),
+    Step("+ extents", strokes, extended),
+    Step("+ shared vertices", strokes, joined),
+    Step("+ joint adjustment: the default", strokes, refined),
 )
 
 

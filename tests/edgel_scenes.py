@@ -1,5 +1,7 @@
 """Views whose edgels are the exact projections of known 3D curves, and what may go wrong with them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -42,15 +44,15 @@ def blank_views(count=VIEWS, cameras=None):
     return Views(tuple(map(str, range(count))), maps, intrinsics, poses, ("",) * count)
 
 
-def project_edgels(views, view, curve, samples=1500):
-    """Points and normals, about half a pixel apart, of one curve in one view."""
+def project_edgels(views, view, curve, samples=1500, apart=0.5):
+    """Points and normals, about `apart` px apart, of one curve in one view."""
     s = np.linspace(0, 1, samples)
     pixels, _ = views.project(curve(s), view)
     ahead, _ = views.project(curve(s) + STEP * tangents(curve, s), view)
     along = ahead - pixels
     normals = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
     travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(pixels, axis=0), axis=1))])
-    chosen = np.unique(np.searchsorted(travelled, np.arange(0, travelled[-1], 0.5)).clip(0, samples - 1))
+    chosen = np.unique(np.searchsorted(travelled, np.arange(0, travelled[-1], apart)).clip(0, samples - 1))
     return pixels[chosen], normals[chosen]
 
 
@@ -75,11 +77,23 @@ def edgel_errors(points, generator, errors):
     return np.sqrt(CORRELATED) * smooth + np.sqrt(1 - CORRELATED) * white
 
 
-def views_of(curves, generator, noise_px=0.0, hidden=0.0, cameras=None, count=VIEWS, strength=1.0, errors="white"):
+def views_of(
+    curves,
+    generator,
+    noise_px=0.0,
+    hidden=0.0,
+    cameras=None,
+    count=VIEWS,
+    strength=1.0,
+    errors="white",
+    apart=0.5,
+    blur=None,
+):
     """Views with the edgels of some curves.
 
     curves: functions of s, or of (view, camera centre) that give one, for contours. noise_px: across each edgel.
-    errors: see `edgel_errors`. hidden: share of the views in which a curve is not seen, drawn anew for each.
+    errors: see `edgel_errors`. hidden: share of the views in which a curve is not seen, drawn anew for each. apart: px,
+    of edgels along an edge; detectors have 1. blur: px, of all edgels; None where it is not known.
     """
     views = blank_views(count, cameras)
     of_views = []
@@ -88,11 +102,13 @@ def views_of(curves, generator, noise_px=0.0, hidden=0.0, cameras=None, count=VI
         for curve in curves:
             if generator.random() >= hidden:
                 seen = curve.seen_from(centre(views, view)) if hasattr(curve, "seen_from") else curve
-                places, across = project_edgels(views, view, seen)
+                places, across = project_edgels(views, view, seen, apart=apart)
                 points.append(places + noise_px * across * edgel_errors(places, generator, errors)[:, None])
                 normals.append(across)
         points, normals = np.concatenate(points), np.concatenate(normals)
-        of_views.append((points, normals, np.full(len(points), strength)))
+        of_views.append(
+            (points, normals, np.full(len(points), strength), np.full(len(points), np.nan if blur is None else blur))
+        )
     return Views(
         views.names,
         views.edge_maps,
@@ -101,6 +117,16 @@ def views_of(curves, generator, noise_px=0.0, hidden=0.0, cameras=None, count=VI
         views.image_paths,
         edgels=Edgels.of_views(of_views),
     )
+
+
+def joined(views, others, seeing):
+    """Views with the edgels of other views as well, in the views `seeing` alone; and (e,) bool, which these are."""
+    of_views, added = [], []
+    for view in range(len(views)):
+        parts = [views.edgels.of_view(view)] + ([others.edgels.of_view(view)] if view in seeing else [])
+        of_views.append(tuple(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+        added.append(np.arange(len(of_views[-1][0])) >= len(parts[0][0]))
+    return replace(views, edgels=Edgels.of_views(of_views)), np.concatenate(added)
 
 
 def centre(views, view):

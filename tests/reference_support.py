@@ -48,22 +48,6 @@ def owned_share(views, points, strength, threshold, claim_px, reach):
     return supported / np.maximum(seen, 1)
 
 
-def has_edge_within(views, points, distances, radius):
-    """(V, n) bool: whether a view has an edge within `radius` (pixels at depth 1) of a point's pixel.
-
-    distances: (V, H, W) pixels. And (V, n) bool: whether float32 may see it otherwise.
-    """
-    near, doubtful = np.zeros((2, len(views), len(points)), bool)
-    for view in range(len(views)):
-        pixels, depths = views.project(points, view)
-        inside = inside_image(pixels, views.width, views.height) & (depths > 0.05)
-        columns, rows = np.rint(np.where(inside[:, None], pixels, 0)).astype(int).T
-        excess = distances[view, rows, columns] - radius / np.where(inside, depths, 1.0)
-        near[view] = inside & (excess <= 0)
-        doubtful[view] = between_pixels(pixels) | (np.abs(excess) < 1e-3)
-    return near, doubtful
-
-
 def between_pixels(pixels, margin=1e-3):
     """(n,) bool: which pixels (n, 2) are so near to the border between two that float32 may round them otherwise."""
     return (np.abs(pixels - np.floor(pixels) - 0.5) < margin).any(axis=1)

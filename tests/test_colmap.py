@@ -338,7 +338,7 @@ def test_edges_come_out_in_the_frame_and_scale_of_colmap(part_project, tmp_path)
     assert "seeds.ply" in facts["files"] and any(re.fullmatch(found, text) for text in told.notes)
     seeds = views.similarity.to_unit(into_colmap(part.edges.sample(0.05)[0]))
     paper = load_scene(tmp_path / "part.yaml", preset="paper", settings=["train.gaussians=500"])
-    started = train.start_of_training(Run(paper, run.folder), views, np.random.default_rng(0)).means
+    started = train.start_of_training(Run(paper, run.folder), views, np.random.default_rng(0))[0].means
     # The paper starts from the model's points; where there are fewer than it wants, random ones join them.
     assert len(seeds) < 400 and len(started) == 500
     assert np.allclose(np.sort(started[: len(seeds)], axis=0), np.sort(seeds, axis=0), atol=1e-5)

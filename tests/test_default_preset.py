@@ -7,6 +7,7 @@ import pytest
 
 from taichi_edges.corridor.loading import load_scene
 from taichi_edges.corridor.pipeline import Run, run_stages
+from taichi_edges.files.splats import read_strokes
 
 pytestmark = pytest.mark.slow(reason="runs the corridor with the default preset")
 
@@ -38,6 +39,8 @@ def test_edges_are_within_a_third_of_a_pixel_of_the_truth(run_once, part, detect
     facts = record["stages"]["prepare"]["facts"]
     assert ("calibration" in facts) == (detector == "auto")
     assert {"detection.png", "truth.json"} <= set(facts["files"])
+    strokes = read_strokes(folder / "gaussians.ply")
+    assert len(strokes) == record["stages"]["train"]["facts"]["gaussians"] and (strokes[1:] >= strokes[:-1]).all()
 
 
 def test_the_same_seed_gives_the_same_edges_bit_for_bit(run_once, tmp_path):

@@ -30,7 +30,7 @@ from taichi_edges.exporters.overlays import (
 from taichi_edges.exporters.viewer import build_geometries, show
 from taichi_edges.files.palette import CLUSTER_COLOURS, CURVE_COLOUR, LINE_COLOUR, UNLABELLED_COLOUR, label_colours
 from taichi_edges.files.point_cloud import read_oriented_points, write_oriented_points
-from taichi_edges.files.splats import FIELDS, HARMONIC_0, read_gaussians, write_gaussians
+from taichi_edges.files.splats import FIELDS, HARMONIC_0, read_gaussians, read_strokes, write_gaussians
 from taichi_edges.geometry.shapes import EllipticArc, Line, Spline, polyline
 from taichi_edges.geometry.wireframe import Edge, Evidence, Wireframe
 from taichi_edges.views.cameras import Similarity, frustum_planes
@@ -149,6 +149,33 @@ def test_gaussians_of_another_program_are_read(tmp_path, rng):
     np.testing.assert_array_equal(log_scales[:, 0], table[:, names.index("scale_0")])
     np.testing.assert_array_equal(quaternions[:, 3], table[:, names.index("rot_3")])
     np.testing.assert_array_equal(opacities, table[:, names.index("opacity")])
+
+
+@pytest.mark.parametrize("count", [0, 257])
+def test_strokes_of_gaussians_come_back_and_other_files_have_none(tmp_path, rng, count):
+    written, strokes = draw_gaussians(rng, count), np.sort(rng.integers(0, 2**24, count))
+    path = write_gaussians(tmp_path / "gaussians.ply", *written, strokes)
+    found = read_strokes(path)
+    assert found.dtype == np.int64
+    np.testing.assert_array_equal(found, strokes)
+    for before, after in zip(written, read_gaussians(path), strict=True):
+        assert after.tobytes() == before.tobytes()
+    header = path.read_bytes().partition(b"end_header\n")[0].decode()
+    assert header.splitlines()[3:] == [f"property float {name}" for name in (*FIELDS, "stroke")]
+    assert read_strokes(write_gaussians(tmp_path / "without.ply", *written)) is None
+
+
+@pytest.mark.parametrize("away, kind", [(0.0, np.float32), (4.5e5, np.float64)], ids=["near", "far"])
+def test_means_are_float64_where_float32_would_move_them(tmp_path, rng, away, kind):
+    """As with coordinates of a land survey: 32 mm is the step of float32 at 450 km."""
+    _, _, quaternions, opacities = draw_gaussians(rng, 40)
+    means = rng.normal(size=(40, 3)) + [away, 0, 0]
+    means = means if away else means.astype(np.float32)
+    path = write_gaussians(tmp_path / "gaussians.ply", means, np.full((40, 3), np.log(0.01)), quaternions, opacities)
+    found, *others = read_gaussians(path)
+    assert found.dtype == kind and all(array.dtype == np.float32 for array in others)
+    np.testing.assert_array_equal(found, means)
+    np.testing.assert_array_equal(others[1], quaternions)
 
 
 @pytest.mark.parametrize(

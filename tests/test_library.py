@@ -18,13 +18,14 @@ import taichi_edges
 from taichi_edges import Run, UserError, evaluate, load_scene, read_edges, read_wireframe, reconstruct, run_stages
 from taichi_edges.corridor import machine, pipeline, prepare
 from taichi_edges.corridor.stages import STAGES, function_of
+from taichi_edges.files.splats import read_strokes
 from taichi_edges.scene.paths import DATA_ROOT, shipped_scenes
 
 ROOT = Path(__file__).parent.parent
 TINY = """
 preset: paper
 source: {reader: synthetic, part: block, views: 6, size: 96}
-train: {epochs: 3, gaussians: 300, seeds: votes}
+train: {epochs: 3, gaussians: 300, seeds: lift}
 filter: {min_opacity: 0.0, min_support: 0.0}
 cluster: {max_gap: 0.3, min_points: 3}
 """
@@ -76,6 +77,11 @@ def test_one_call_leads_from_a_scene_to_its_wireframe(tiny):
     assert (config.seed, config.fit.min_length, config.fit.line_tolerance) == (3, 0.02, 0.005)
     with pytest.raises(FrozenInstanceError):
         found.metrics = None
+
+
+def test_gaussians_that_were_culled_and_copied_are_on_no_strokes(tiny):
+    """The paper's schedule; who is left has no place in their order."""
+    assert read_strokes(tiny[2].folder / "gaussians.ply") is None
 
 
 def test_a_second_call_reuses_what_the_first_has_written_and_reports_as_the_command_does(tiny, capsys):

@@ -420,7 +420,7 @@ def test_changing_the_fit_runs_from_fit_on(copied):
 
 def test_a_stage_whose_inputs_come_out_the_same_is_skipped(copied):
     """The cluster stage has to run for its changed setting, but its clusters are the same, so fit need not."""
-    _, said = rerun(copied, ["filter.harvest=false"])  # of no effect without filter.refine
+    _, said = rerun(copied, ["filter.min_views=2.0"])  # of no effect without filter.refine
     assert said.states() == states(
         ran=("cluster",), skipped=("prepare", "train", "fit", "refine", "evaluate", "export")
     )

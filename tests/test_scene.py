@@ -131,9 +131,11 @@ def test_an_unknown_key_like_no_other_lists_the_known_ones(scene):
     assert "known here: delta, line_tolerance, min_length" in refusal(scene("fit: {zzzzqq: 3}"))
 
 
-def test_a_key_that_is_gone_says_what_to_do(scene):
-    path = scene("filter: {grow_step: 0.5}")
-    assert refusal(path) == f"{path}: filter.grow_step: unknown key; it is gone, and growing with it; leave it out"
+@pytest.mark.parametrize("key", ["grow_step: 0.5", "grow: 0.1", "harvest: true", "min_angle: 15.0"])
+def test_a_key_that_is_gone_says_what_to_do(scene, key):
+    path = scene(f"filter: {{{key}}}")
+    said, gone = refusal(path), f"{path}: filter.{key.split(':')[0]}: unknown key; it is gone, for "
+    assert said.startswith(gone) and said.endswith("; leave it out")
 
 
 def test_all_mistakes_are_counted(scene):
@@ -467,7 +469,7 @@ def test_photographs_are_taken_for_what_their_reader_reads(scene, reader, expect
     config = load_scene(scene(source, base=""))
     assert config.scale == expected and config.train.seeds == "sweep" and config.source.min_chain > 0
     part = load_scene(scene(f"{source}scale: part", base=""))
-    assert part.scale == "part" and part.train.seeds == "votes" and part.source.min_chain == 0
+    assert part.scale == "part" and part.train.seeds == "lift" and part.source.min_chain == 0
     assert load_scene(scene(source, base=""), scale="room").refine.anchor
 
 
@@ -475,9 +477,9 @@ def test_photographs_are_taken_for_what_their_reader_reads(scene, reader, expect
 def test_renderings_are_parts_whose_settings_are_those_of_the_preset(scene, reader):
     config = load_scene(scene(f"source: {{reader: {reader}, path: there}}", base=""))
     assert config.scale == "part" and SCALES["part"] == {"fast": {}, "paper": {}}
-    assert (config.train.seeds, config.source.min_chain, config.source.tolerance_px) == ("votes", 0, 0.5)
-    kept = config.filter.min_views, config.filter.min_angle, config.refine.min_support, config.refine.min_steadiness
-    assert kept == (3.0, 15.0, 0.0, 0.66) and not config.refine.anchor
+    assert (config.train.seeds, config.source.min_chain, config.source.tolerance_px) == ("lift", 0, 0.5)
+    assert (config.filter.min_views, config.refine.min_views, config.refine.min_support) == (2.5, 2.5, 0.0)
+    assert config.refine.verdict and not config.refine.anchor
 
 
 def test_an_unknown_scale_is_refused(scene):

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from taichi_edges.detectors.subpixel import detect_edgels, trace_pictures
 from taichi_edges.errors import UserError
@@ -74,6 +75,39 @@ def test_lines_are_found_to_a_tenth_of_a_pixel_whatever_their_angle_and_contrast
     assert np.abs(errors).max() < 0.1
     assert np.median(np.abs(errors)) < 0.03
     assert abs(np.median(errors)) < 0.01
+
+
+def blurred(angle, centre, sigma):
+    """8-bit picture of a step that is blurred by `sigma` px before the pixels blur it."""
+    steps = (np.arange(SIZE * FINE) + 0.5) / FINE - 0.5
+    away = (steps - centre[0]) * np.cos(angle) + (steps[:, None] - centre[1]) * np.sin(angle)
+    share = ndtr(away / sigma) if sigma else (away > 0).astype(float)
+    return mixed(share.reshape(SIZE, FINE, SIZE, FINE).mean(axis=(1, 3)), 0.1, 0.8)
+
+
+def blurs_of(picture):
+    """Blurs of the edgels that are not near the border."""
+    points, _, _, blurs = detect_edgels(picture)
+    assert len(points) == len(blurs) > 0.7 * SIZE
+    return blurs[within(points)]
+
+
+@pytest.mark.parametrize("sigma", [0.5, 0.8, 1.5, 2.5])
+def test_a_blurred_step_tells_by_how_much(sigma, generator):
+    for angle in generator.uniform(0, 2 * np.pi, 4):
+        blurs = blurs_of(blurred(angle, generator.uniform(42, 54, 2), sigma))
+        assert np.median(blurs) == pytest.approx(sigma, rel=0.2) and np.abs(blurs / sigma - 1).max() < 0.4
+
+
+def test_a_sharp_step_is_not_blurred(generator):
+    for angle in generator.uniform(0.25, np.pi / 2 - 0.25, 6) + np.pi / 2 * generator.integers(0, 4, 6):
+        assert np.quantile(blurs_of(blurred(angle, generator.uniform(42, 54, 2), 0)), 0.9) < 0.2
+
+
+def test_a_sharp_step_along_the_pixels_looks_blurred_by_less_than_half_a_pixel(generator):
+    """How wide its gradient seems depends on where in a pixel it is: up to 0.44 px at the pixel's centre."""
+    for angle in np.pi / 2 * np.arange(4):
+        assert blurs_of(blurred(angle, generator.uniform(42, 54, 2), 0)).max() < 0.48
 
 
 @pytest.mark.parametrize("radius", [5.0, 12.0, 30.0])

@@ -298,20 +298,20 @@ class Warned(Progress):
         self.lines.append(text)
 
 
-def test_three_views_are_too_few_to_sweep_and_start_from_votes(taichi, generator, tmp_path):
+def test_three_views_are_too_few_to_sweep_and_their_edgels_are_lifted(taichi, generator, tmp_path):
     config = SceneConfig(source={"reader": "emap", "path": "there"}, train={"seeds": "sweep", "gaussians": 300})
     warned, views = Warned(), views_of(CURVES, generator, count=3)
     train.start_of_training(Run(config, tmp_path, progress=warned), views, np.random.default_rng(0))
     assert warned.lines[0].startswith("fewer than 4 views see the same")
-    assert warned.lines[0].endswith("the training starts from votes")
+    assert warned.lines[0].endswith("the edgels are lifted instead")
 
 
 def test_without_seeds_the_training_says_so_and_starts_from_random_points(taichi, tmp_path):
     config = SceneConfig(source={"reader": "emap", "path": "there"}, train={"seeds": "sweep", "gaussians": 300})
     warned = Warned()
-    gaussians = train.start_of_training(
+    gaussians, strokes = train.start_of_training(
         Run(config, tmp_path, progress=warned), without_edgels(8), np.random.default_rng(0)
     )
-    assert len(gaussians) == 300 and len(warned.lines) == 1
+    assert strokes is None and len(gaussians) == 300 and len(warned.lines) == 1
     assert "the views agree on an edge in fewer than 50 places" in warned.lines[0]
     assert warned.lines[0].endswith("the training starts from random points instead")

@@ -34,7 +34,7 @@ def train(run: "Run") -> dict[str, Any]:
         gaussians.log_scales - np.float32(np.log(similarity.scale)),
         gaussians.quaternions,
         gaussians.opacity_logits,
-        strokes,
+        None if config.density.changes_number else strokes,  # who is left, or a copy, has no place in their order
     )
     loss = records[-1].loss if np.isfinite(records[-1].loss) else None  # no step may have measured it alone
     return {"gaussians": len(gaussians), "view_steps": records[-1].step, "final_loss": loss}

@@ -115,12 +115,14 @@ _WORDS = {
 
 # Keys that a scene does not have any more, or never had, and what to do instead.
 _NO_KEYS = {
-    "filter.grow": "it is gone: strokes of edgels reach as far as the views show them; leave it out",
-    "filter.grow_step": "it is gone, and growing with it; leave it out",
-    "filter.harvest": "it is gone: what few views see is lifted with the rest; leave it out",
-    "filter.min_steadiness": "it is gone: whole edges are judged; see refine.min_confidence, refine.min_steadiness",
-    "filter.min_evidence": "it is gone: whole edges are judged; see refine.min_confidence",
-    "filter.min_angle": "it is gone: the verdict on an edge weighs from where it is seen; see refine.min_confidence",
+    **dict.fromkeys(
+        ("filter.grow", "filter.grow_step", "filter.harvest"),
+        "it is gone, for the strokes of train.seeds: lift reach the ends of their edges; leave it out",
+    ),
+    **dict.fromkeys(
+        ("filter.min_steadiness", "filter.min_evidence", "filter.min_angle"),
+        "it is gone, for refine.verdict tells edges from what is none; leave it out",
+    ),
     "stage": "the stage to start with is --stage on the command line, the argument start from Python",
     "show": "the window is opened by the command line alone, with --show",
 }

@@ -147,6 +147,11 @@ class DensityConfig(Section):
     min_support: Share = Field(0.05, description="share of the views whose edge pixels a centre must hit")
     reset_opacity: bool = Field(False, description="opacities down to the initial one after a cull")
 
+    @property
+    def changes_number(self) -> bool:
+        """Whether there are other Gaussians at the end than at the start."""
+        return bool(self.duplicate_at or self.cull_opacity_at or self.cull_support_at)
+
 
 class TrainConfig(Section):
     """Training of the Gaussians (paper 3.1, 3.2, supplement).

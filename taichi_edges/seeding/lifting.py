@@ -50,7 +50,7 @@ class Lifted:
 
     points, directions: (e, CANDIDATES, 3) unit cube, and unit vectors along the edge. evidence: (e, CANDIDATES) log
     likelihood ratio that the edge is there, over that the views agree by chance; 0 where there is no candidate.
-    parallax: (e, CANDIDATES) px by which the best of the views that agree would see a unit of inverse depth.
+    parallax: (e, CANDIDATES) px by which the view that the depth is from would see a unit of inverse depth.
     """
 
     points: np.ndarray

@@ -1,0 +1,83 @@
+"""How likely an edge is one: edges, contours and rounded edges are told apart."""
+
+import numpy as np
+import pytest
+from edgel_scenes import CylinderContour, arc, centre, line, views_of
+
+from taichi_edges.evidence.edgel_matching import EdgelMatching
+from taichi_edges.evidence.verdict import FITTED, MARKS, MOST_BLUR_PX, SHARP_PX, marks_of, probabilities
+from taichi_edges.geometry.shapes import Line
+
+A = line([0.2, 0.3, 0.3], [0.8, 0.35, 0.4])
+RIM = arc([0.5, 0.5, 0.6], 0.25)
+PIXEL = 0.004608  # of the default views, unit-cube units
+NOISE_PX = 0.1
+
+
+def shape(curve):
+    """The Line from one end of a curve to the other."""
+    return Line(curve(np.array([0.0, 1.0])))
+
+
+def verdicts(views, *curves):
+    """(n,) probabilities of lines."""
+    return probabilities(marks_of(EdgelMatching(views), [shape(curve) for curve in curves], NOISE_PX))
+
+
+@pytest.mark.parametrize("radius_px", [2, 6, 15, 40])
+def test_an_edge_is_one_and_the_contour_of_a_cylinder_is_none(taichi, generator, radius_px):
+    contour = CylinderContour([0.6, 0.5], radius_px * PIXEL, 0.2, 0.8)
+    views = views_of([A, RIM, contour], generator, noise_px=NOISE_PX, apart=1.0)
+    edge, *contours = verdicts(views, A, *(contour.seen_from(centre(views, view)) for view in (0, 7, 15)))
+    assert edge > 0.8 and max(contours) < 0.3
+
+
+def test_an_edge_that_a_third_of_the_views_see_is_one(taichi, generator):
+    views = views_of([A, RIM], generator, noise_px=NOISE_PX, hidden=0.66, apart=1.0)
+    assert verdicts(views, A)[0] > 0.8
+
+
+def test_a_blurred_edge_is_less_likely_one_than_a_sharp_one(taichi, generator):
+    state = generator.bit_generator.state
+    found = {}
+    for blur in (0.0, SHARP_PX, 0.5, 1.5, None):
+        generator.bit_generator.state = state  # the same noise
+        views = views_of([A, RIM], generator, noise_px=NOISE_PX, apart=1.0, blur=blur)
+        found[blur] = verdicts(views, A)[0]
+    assert found[0.0] == found[SHARP_PX] == found[None]  # ready maps do not tell
+    assert found[0.0] > found[0.5] > found[1.5] and found[0.0] - found[1.5] > 0.2
+
+
+def test_marks_are_what_they_say(taichi, generator):
+    contour = CylinderContour([0.6, 0.5], 8 * PIXEL, 0.2, 0.8)
+    views = views_of([A, RIM, contour], generator, noise_px=NOISE_PX, apart=1.0, blur=0.5)
+    nothing = line([0.1, 0.9, 0.1], [0.2, 0.9, 0.9])
+    curves = [A, contour.seen_from(centre(views, 3)), nothing]
+    marks = marks_of(EdgelMatching(views), [shape(curve) for curve in curves], NOISE_PX)
+    assert marks.shape == (3, len(MARKS)) and len(FITTED.marks) == len(MARKS)
+    steadiness, blur, spread, sharpness = marks.T
+    assert steadiness[0] > 0.95 and steadiness[1] < 0.8 and sharpness[0] > 0.95 and sharpness[1] < 0.6
+    assert blur[0] == pytest.approx(0.5 - SHARP_PX) and blur[2] == MOST_BLUR_PX - SHARP_PX
+    assert spread[0] == 0.5 and spread[2] == 0 and steadiness[2] < 0.5
+    assert probabilities(marks)[2] < 0.01
+
+
+def test_two_edges_beside_each_other_do_not_speak_against_each_other(taichi, generator):
+    """Two pixels apart, as the two sides of a chamfer: the edgels of the other edge are about each."""
+    pair = [A, line([0.2, 0.3, 0.3 + 2 * PIXEL], [0.8, 0.35, 0.4 + 2 * PIXEL])]
+    views = views_of([*pair, RIM], generator, noise_px=NOISE_PX, apart=1.0)
+    assert verdicts(views, *pair).min() > 0.8
+
+
+def test_no_edges_get_no_verdict(taichi, generator):
+    marks = marks_of(EdgelMatching(views_of([A], generator, count=4)), [], NOISE_PX)
+    assert marks.shape == (0, len(MARKS)) and probabilities(marks).shape == (0,)
+
+
+def test_probabilities_rise_with_what_speaks_for_an_edge():
+    sure, doubtful = np.array([[1.0, 0.0, 0.5, 1.0]]), np.array([[0.3, 0.5, 0.0, 0.3]])
+    assert probabilities(sure)[0] > 0.95 and probabilities(doubtful)[0] < 0.01
+    for mark, sign in zip(range(len(MARKS)), (1, -1, 1, 1), strict=True):
+        more = sure.copy()
+        more[0, mark] += 0.1
+        assert np.sign(probabilities(more) - probabilities(sure))[0] == sign
