@@ -20,18 +20,20 @@ MOST_NOISE_PX = 0.5  # poses and maps that are off by more tell no two edges apa
 PROBE_PX = 1.0  # of the edgels that tell it
 BEST_SUPPORTED = 0.2  # share of the points whose edgels tell it; the others may be on no edge
 
-LIFT_NOISES = 5.0  # by which edgels of an edge may disagree: each of two is off, and the ray as well
-SCALE_NOISES = 2.5  # residual at which an edgel's weight has fallen to a quarter
-RADII_NOISES = (10.0, 8.0, 6.0)  # of the edgels looked at while points are moved to their edge, round by round
-ON_NOISES = 5.5  # within so much an edgel is an edge's
+LIFT_NOISES = 4.25  # by which edgels of an edge may disagree: each of two is off, and the ray as well
+SCALE_NOISES = 2.1  # residual at which an edgel's weight has fallen to a quarter
+RADII_NOISES = (8.5, 7.0, 5.0)  # of the edgels looked at while points are moved to their edge, round by round
+ON_NOISES = 4.7  # within so much an edgel is an edge's
+TAKEN_NOISES = 2.2  # and within so much nobody else's: an edge may run beside another
 
 
 def noise_of(matching: "EdgelMatching", placed: "RefinedPoints") -> float:
     """Standard deviation of the edgels across their edges, px: of those about the best supported of RefinedPoints."""
     if not len(placed):
         return MOST_NOISE_PX
-    best = placed.keep(placed.views >= np.quantile(placed.views, 1 - BEST_SUPPORTED))
-    about = EdgelsAbout.of(matching, best.points, best.directions, PROBE_PX)
-    residuals = np.abs(about.residuals[about.there])
+    about = EdgelsAbout.of(matching, placed.points, placed.directions, PROBE_PX)
+    counts = about.there.sum(axis=1)  # not the weights, which would choose small residuals
+    best = counts >= np.quantile(counts, 1 - BEST_SUPPORTED)
+    residuals = np.abs(about.residuals[best][about.there[best]])
     noise = NORMAL_MAD * float(np.median(residuals)) if len(residuals) else MOST_NOISE_PX
     return float(np.clip(noise, LEAST_NOISE_PX, MOST_NOISE_PX))

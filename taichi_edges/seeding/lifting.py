@@ -50,7 +50,7 @@ class Lifted:
 
     points, directions: (e, CANDIDATES, 3) unit cube, and unit vectors along the edge. evidence: (e, CANDIDATES) log
     likelihood ratio that the edge is there, over that the views agree by chance; 0 where there is no candidate.
-    parallax: (e, CANDIDATES) px by which the view that the depth is from would see a unit of inverse depth.
+    parallax: (e, CANDIDATES) px by which the view that tells the depth best would see a unit of inverse depth.
     """
 
     points: np.ndarray
@@ -146,7 +146,7 @@ def lift_rays(
                             best, which = scores[worker, k], k
                     if which >= 0:
                         found[i, 4 * c], found[i, 4 * c + 1] = depths[worker, which], turns[worker, which]
-                        found[i, 4 * c + 2], found[i, 4 * c + 3] = best, slopes[worker, which]
+                        found[i, 4 * c + 2], found[i, 4 * c + 3] = best, most
                         for k in range(count):
                             if ti.abs(depths[worker, k] - depths[worker, which]) * most < APART_PX:
                                 scores[worker, k] = 0.0

@@ -21,6 +21,7 @@ from taichi_edges.evidence.noise import (
     PROBE_PX,
     RADII_NOISES,
     SCALE_NOISES,
+    TAKEN_NOISES,
     noise_of,
 )
 from taichi_edges.evidence.viewing_planes import refine_points
@@ -53,7 +54,7 @@ def propose(views: Views, matching: EdgelMatching, report: "Callable[[int], None
     radii = tuple(noise * factor for factor in RADII_NOISES)
     placed = refine_points(matching, strokes.points, strokes.directions, radii, SCALE_NOISES * noise)
     strokes = Strokes(placed.points, placed.directions, strokes.edgels, strokes.numbers)
-    return Proposals(explaining(matching, strokes, ON_NOISES * noise), noise)
+    return Proposals(explaining(matching, strokes, noise), noise)
 
 
 def noise_of_views(views: Views, matching: EdgelMatching) -> float:
@@ -81,11 +82,9 @@ def likely_points(views: Views, count: int) -> tuple[np.ndarray, np.ndarray]:
     return lifted.points[best, 0], lifted.directions[best, 0]
 
 
-def explaining(matching: EdgelMatching, strokes: Strokes, on_px: float) -> Strokes:
-    """The Strokes that explain edgels which no better one explains, cut to where they do.
-
-    on_px: within so much an edgel is a stroke's.
-    """
+def explaining(matching: EdgelMatching, strokes: Strokes, noise_px: float) -> Strokes:
+    """The Strokes that explain edgels which no better one explains, cut to where they do. noise_px: of the edgels."""
+    on_px = ON_NOISES * noise_px
     about = EdgelsAbout.of(matching, strokes.points, strokes.directions, on_px)
     weights = about.closeness(on_px)
     bounds, free = strokes.starts, np.ones(len(matching.edgels) + 1, bool)
@@ -115,8 +114,8 @@ def explaining(matching: EdgelMatching, strokes: Strokes, on_px: float) -> Strok
         for first, last in runs_of(views >= matching.least_views):
             part = np.arange(bounds[stroke] + first, bounds[stroke] + last)
             kept.append(part)
-            taken = about.edgels[part]
-            free[matching.neighbors[taken[taken >= 0]].ravel()] = False
+            taken = about.edgels[part][about.within(TAKEN_NOISES * noise_px)[part]]
+            free[matching.neighbors[taken].ravel()] = False
     if not kept:
         return strokes.keep(slice(0))
     numbers = np.repeat(np.arange(len(kept)), [len(part) for part in kept])
