@@ -572,8 +572,7 @@ def filtered(points, opacities=None, **config):
     opacities = np.ones(len(points)) if opacities is None else opacities
     directions = np.stack([np.arange(len(points)), np.zeros(len(points)), np.zeros(len(points))], axis=1)
     settings = FilterConfig(**{"outlier_neighbors": 0, "refine": False, **config})
-    random = np.random.default_rng(0)
-    found, counts = filter_points(points, directions, opacities, four_views(), settings, 0.5, random)
+    found, counts = filter_points(points, directions, opacities, four_views(), settings, 0.5)
     kept = found.directions[:, 0].astype(int)
     np.testing.assert_array_equal(found.points, np.asarray(points)[kept])
     assert counts.gaussians == len(points)
@@ -601,7 +600,7 @@ def test_support_counts_only_the_views_that_see_a_point(taichi):
     views = Views(views.names, views.edge_maps, views.intrinsics, away, views.image_paths)
     points = points_on_column(3)
     settings = FilterConfig(min_support=1.0, outlier_neighbors=0, refine=False)
-    assert len(filter_points(points, points, np.ones(3), views, settings, 0.5, np.random.default_rng(0))[0]) == 3
+    assert len(filter_points(points, points, np.ones(3), views, settings, 0.5)[0]) == 3
 
 
 def test_support_is_a_share_of_the_views(taichi):
@@ -612,7 +611,7 @@ def test_support_is_a_share_of_the_views(taichi):
     points = points_on_column(3)
     for share, expected in ((0.25, 3), (0.26, 0)):
         settings = FilterConfig(min_support=share, outlier_neighbors=0, refine=False)
-        found = filter_points(points, points, np.ones(3), views, settings, 0.5, np.random.default_rng(0))[0]
+        found = filter_points(points, points, np.ones(3), views, settings, 0.5)[0]
         assert len(found) == expected
 
 

@@ -109,10 +109,7 @@ def test_runs_hold_short_gaps_and_no_lonely_points():
     assert runs_of(np.zeros(9, bool)) == runs_of(np.zeros(0, bool)) == []
 
 
-LOW = "measured: 37 % too low, as points are chosen by how closely edgels lie on them, and the nearest edgel is asked"
-
-
-@pytest.mark.parametrize("noise_px", [0.1, pytest.param(0.3, marks=pytest.mark.xfail(reason=LOW, strict=True))])
+@pytest.mark.parametrize("noise_px", [0.1, 0.3])
 def test_the_noise_of_the_edgels_is_measured(taichi, generator, noise_px):
     views = views_of(CURVES, generator, noise_px=noise_px, apart=1.0)
     assert noise_of_views(views, EdgelMatching(views)) == pytest.approx(noise_px, rel=0.3)
