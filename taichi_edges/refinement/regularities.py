@@ -43,6 +43,7 @@ MOST_TURN = np.radians(2.0)  # what is farther from parallel or perpendicular is
 MOST_OFF_PX, MOST_RATIO = 3.0, 0.05  # distances and radii, likewise
 DEVIATION = 1e-4  # of what is imposed, radians or unit-cube units, until it is made exact
 IMPLIED = 1e-6  # standard deviation of what other relations imply
+LEAST_TOLD = 1e-12  # of what is told most about an unknown: what nothing is told about stays a number
 CLOSE = 2e-3  # how far it may be off as these are linear
 RADIUS_PX = 1.0  # of the edgels from which covariances come
 CHECKS = 4  # adjustments after which relations that the images contradict have been given up
@@ -151,7 +152,8 @@ class Judge:
         image = image_equations(problem, wireframe, matching, RADIUS_PX)
         joints = [*smooth_joints(wireframe), *contacts(wireframe, matching.pixel)]
         matrix = (image.matrix() + constrained(layout, wireframe, joints).matrix()).toarray()
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        told = np.diag(matrix)
+        scale = 1.0 / np.sqrt(np.maximum(told, LEAST_TOLD * told.max(initial=1e-300)))
         covariance = (
             np.linalg.inv(matrix * scale * scale[:, None] + 1e-12 * np.eye(len(scale))) * scale * scale[:, None]
         )
@@ -188,6 +190,8 @@ class Judge:
 
     def rise(self, linear: Linear) -> float:
         """Rise of the sum of squares for each unknown that a relation takes away; 0 where it is implied."""
+        if not (np.isfinite(linear.slopes).all() and np.isfinite(linear.values).all()):
+            return np.inf  # a shape that has degenerated has no relations
         found = self._axes(linear)
         off, free = found.off, found.free
         if (np.abs(off[~free]) > CLOSE).any():
