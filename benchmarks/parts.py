@@ -382,6 +382,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="of the real parts; others: the first")
     parser.add_argument("--sheets", type=Path, help="folder for a picture of each real part")
     parser.add_argument("--fit-verdict", action="store_true", help="fit the weights of evidence/verdict.py anew")
+    parser.add_argument("--keep", action="store_true", help="measure runs that are there, and run only the others")
     parser.add_argument(
         "--least", type=float, default=0.0, help="F5 in %% that the mean of all must reach, else status 1"
     )
