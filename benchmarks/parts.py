@@ -208,8 +208,10 @@ def calibration_error(rows: np.ndarray) -> float:
 # The verdict's weights ------------------------------------------------------------------------------------------------
 
 
-def marks_of_job(job: Job, out: Path, data: Path | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of all edges of a run that nobody has judged yet: marks (E, k), share that is right (E,), length in px (E,)."""
+def marks_of_job(job: Job, out: Path, data: Path | None) -> tuple[np.ndarray, ...]:
+    """Of all edges of a run that nobody has judged, and then of its strokes: marks (E, k), share that is right (E,),
+    length in px (E,), and (E,) bool, which are strokes.
+    """
     from taichi_edges.corridor.evaluate import ground_truth_of
     from taichi_edges.evidence.edge_support import EdgeSamples, support_of
     from taichi_edges.evidence.edgel_matching import EdgelMatching
@@ -230,11 +232,14 @@ def marks_of_job(job: Job, out: Path, data: Path | None) -> tuple[np.ndarray, np
         points = views.similarity.to_unit(transform(np.linalg.inv(views.input_to_truth), points))
     loose = read_wireframe(folder / "edges_fit.json").transformed(views.similarity.to_unit, views.similarity.scale)
     unjudged, _ = refine_wireframe(loose, views, config.refine.model_copy(update={"min_confidence": 0.0}))
-    matching, shapes = EdgelMatching(views), [*unjudged.shapes, *loose.shapes]
-    marks = marks_of(matching, shapes, edgel_noise(support_of(matching, unjudged.shapes)))
-    samples = EdgeSamples.along(shapes, SPACING)
-    right = samples.sums(near(samples.points, points).astype(float)) / np.maximum(np.diff(samples.starts), 1)
-    return marks, right, np.array([shape.length for shape in shapes]) / matching.pixel
+    matching, found = EdgelMatching(views), []
+    for shapes in (unjudged.shapes, loose.shapes):  # each by itself: the same edge twice would take its own edgels
+        marks = marks_of(matching, shapes, edgel_noise(support_of(matching, shapes)))
+        samples = EdgeSamples.along(shapes, SPACING)
+        right = samples.sums(near(samples.points, points).astype(float)) / np.maximum(np.diff(samples.starts), 1)
+        found.append((marks, right, np.array([shape.length for shape in shapes]) / matching.pixel))
+    marks, right, lengths = (np.concatenate(columns) for columns in zip(*found, strict=True))
+    return marks, right, lengths, np.arange(len(lengths)) >= len(unjudged)
 
 
 def fitted_weights(marks: np.ndarray, right: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -259,8 +264,11 @@ def print_fitted(done: list[Job], out: Path, data: Path | None, pool: ProcessPoo
     found = dict(zip(first, pool.map(marks_of_job, first, [out] * len(first), [data] * len(first)), strict=True))
 
     def fitted(some: list[Job]) -> np.ndarray:
-        # Every scene counts alike, a real part as three: they are what the verdict is for.
-        weights = [found[job][2] / found[job][2].sum() * (600 if job.group == "parts" else 200) for job in some]
+        # Every scene counts alike, a real part as three: they are what the verdict is for. Strokes count half.
+        weights = []
+        for job in some:
+            weighted = found[job][2] * np.where(found[job][3], 0.5, 1.0)
+            weights.append(weighted / weighted.sum() * (600 if job.group == "parts" else 200))
         marks, right, _ = (np.concatenate([found[job][k] for job in some]) for k in range(3))
         return fitted_weights(marks, right, np.concatenate(weights))
 
@@ -269,7 +277,7 @@ def print_fitted(done: list[Job], out: Path, data: Path | None, pool: ProcessPoo
     for job in first:
         others = [other for other in first if other.name.split("_")[:2] != job.name.split("_")[:2]]
         b = fitted(others)
-        marks, right, length = found[job]
+        marks, right, length = (column[~found[job][3]] for column in found[job][:3])
         likely = 1 / (1 + np.exp(-(marks @ b[:-1] + b[-1])))
         rows.append([job.name, calibration_error(np.column_stack([likely, length, right]))])
     print("\nExpected calibration error of each scene, by weights fitted to the others:\n")

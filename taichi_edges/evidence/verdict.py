@@ -32,6 +32,7 @@ BLUR_QUANTILE = 0.75  # of the views: outlines are sharp however round the edge 
 SHARP_PX = 0.25  # up to so much edges are as sharp as pictures are
 MOST_BLUR_PX = 0.75  # more says no more
 ENOUGH_SPREAD = 0.5  # sine of the angle between viewing planes, 30 degrees: more says no more
+PRIOR = 2.0  # views that say no, added to all: of two or three that agree the share that does is no certainty
 PLACES, PLACE_PX = 4, 4.0  # of an edge, where radii are tried: at most so many, so far apart at least
 MARKS = ("steadiness", "blur", "spread", "sharpness")
 
@@ -44,7 +45,7 @@ class Weights:
     constant: float
 
 
-FITTED = Weights((2.85, -6.47, 1.8, 5.58), -5.27)  # not chosen: see the module's first lines
+FITTED = Weights((3.73, -6.76, 1.62, 6.16), -5.28)  # not chosen: see the module's first lines
 
 
 def probabilities(marks: np.ndarray, weights: Weights = FITTED) -> np.ndarray:
@@ -95,7 +96,7 @@ def _sharpness(matching: EdgelMatching, samples: EdgeSamples, tight_px: float) -
     chosen = samples.starts[edge] + ((place + 0.5) * lengths[edge] / counts[edge]).astype(int)
     found = rounding_at(matching, samples.points[chosen], samples.directions[chosen], tight_px)
     sharp, rounded = (np.bincount(edge, views, len(lengths)) for views in (found.views, found.rounded))
-    return sharp / np.maximum(rounded, 1.0)
+    return sharp / np.maximum(rounded + PRIOR * counts, 1.0)
 
 
 def _owners(matching: EdgelMatching, samples: EdgeSamples, about: EdgelsAbout, on_px: float) -> np.ndarray:
@@ -128,7 +129,7 @@ def _steadiness(
     mine = seeing[number]
     together = [(mine & seeing[k]).sum() / max(mine.sum(), 1) if k not in (-1, number) else 0.0 for k in others]
     against = 1.0 - np.clip(np.array(together) / TOGETHER, 0.0, 1.0)
-    return float(steadiness(views, views + against[position].sum() / max(len(on), 1)))
+    return float(steadiness(views, views + against[position].sum() / max(len(on), 1) + PRIOR))
 
 
 def _blur(matching: EdgelMatching, about: EdgelsAbout, on: np.ndarray, mine: np.ndarray) -> float:
