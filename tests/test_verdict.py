@@ -5,7 +5,7 @@ import pytest
 from edgel_scenes import CylinderContour, arc, centre, line, views_of
 
 from taichi_edges.evidence.edgel_matching import EdgelMatching
-from taichi_edges.evidence.verdict import FITTED, MARKS, MOST_BLUR_PX, SHARP_PX, marks_of, probabilities
+from taichi_edges.evidence.verdict import FITTED, MARKS, MOST_BLUR_PX, PRIOR, SHARP_PX, marks_of, probabilities
 from taichi_edges.geometry.shapes import Line
 
 A = line([0.2, 0.3, 0.3], [0.8, 0.35, 0.4])
@@ -56,7 +56,8 @@ def test_marks_are_what_they_say(taichi, generator):
     marks = marks_of(EdgelMatching(views), [shape(curve) for curve in curves], NOISE_PX)
     assert marks.shape == (3, len(MARKS)) and len(FITTED.marks) == len(MARKS)
     steadiness, blur, spread, sharpness = marks.T
-    assert steadiness[0] > 0.95 and steadiness[1] < 0.8 and sharpness[0] > 0.95 and sharpness[1] < 0.6
+    most = 24 / (24 + PRIOR)  # all views say yes
+    assert steadiness[0] > 0.95 * most and steadiness[1] < 0.8 and sharpness[0] > 0.95 * most and sharpness[1] < 0.6
     assert blur[0] == pytest.approx(0.5 - SHARP_PX) and blur[2] == MOST_BLUR_PX - SHARP_PX
     assert spread[0] == 0.5 and spread[2] == 0 and steadiness[2] < 0.5
     assert probabilities(marks)[2] < 0.01
