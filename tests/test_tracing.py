@@ -70,7 +70,7 @@ def test_a_stroke_does_not_jump_between_edges_two_pixels_apart(taichi, generator
 
 def test_each_edge_is_explained_once(taichi, generator):
     views = views_of(CURVES, generator, noise_px=0.1, apart=1.0)
-    strokes, pixel = propose(views, EdgelMatching(views)).strokes, pixel_of(views)
+    strokes, pixel = propose(views, EdgelMatching(views)), pixel_of(views)
     away, which = nearest_of(CURVES, strokes.points, pixel)
     assert away.max() < 0.5
     for number, curve in enumerate(CURVES):
@@ -79,7 +79,7 @@ def test_each_edge_is_explained_once(taichi, generator):
         covered = np.array([distances_to(lambda _, some=some: some, curve(s)) < 2.5 * pixel for some in near])
         assert covered.any(axis=0).mean() > 0.97  # their ends are a matter of the noise
         assert covered.sum(axis=0).mean() < 1.25
-    found = propose(views, EdgelMatching(views)).strokes
+    found = propose(views, EdgelMatching(views))
     np.testing.assert_array_equal(found.points, strokes.points)
 
 
@@ -87,7 +87,7 @@ def test_each_edge_is_explained_once(taichi, generator):
 def test_an_edge_that_four_of_24_views_see_is_found(taichi, generator, seeing):
     others, rare = (views_of(curves, generator, 0.1, apart=1.0) for curves in ([A, RIM], [UPRIGHT]))
     views, _ = joined(others, rare, seeing)
-    points, pixel = propose(views, EdgelMatching(views)).strokes.points, pixel_of(views)
+    points, pixel = propose(views, EdgelMatching(views)).points, pixel_of(views)
     assert (distances_to(lambda _: points, UPRIGHT(np.linspace(0, 1, 300))) < 2.5 * pixel).mean() > 0.85
     assert (nearest_of(CURVES, points, pixel)[0] > 1).mean() < 0.02
 
@@ -118,4 +118,4 @@ def test_the_noise_of_the_edgels_is_measured(taichi, generator, noise_px):
 def test_blank_views_and_one_view_alone_propose_nothing(taichi, generator):
     for views in (views_of([], generator), views_of([A], generator, count=1)):
         found = propose(views, EdgelMatching(views))
-        assert len(found.strokes) == 0 and found.strokes.starts.tolist() == [0]
+        assert len(found) == 0 and found.starts.tolist() == [0]

@@ -82,7 +82,7 @@ def _lifted(run: "Run", views: Views) -> "tuple[Gaussians | None, np.ndarray | N
     config = run.config.train
     matching = EdgelMatching(views, run.config.filter.min_views)
     with run.progress.track("lift", len(views)) as report:
-        strokes = propose(views, matching, report).strokes
+        strokes = propose(views, matching, report)
     if len(strokes) < min(LEAST_SEEDS, config.gaussians):
         return None, None
     return stroke_gaussians(strokes, matching.pixel, config.gaussians, config.initial_opacity)

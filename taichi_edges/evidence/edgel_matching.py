@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from taichi_edges.arrays import robust
 from taichi_edges.evidence.plane_equations import GRADIENT, NUMBERS, VIEWS, WEIGHT, PlaneEquations
 from taichi_edges.kernels.device import download, upload
-from taichi_edges.kernels.edgel_grid import CELL, EdgelGrid
+from taichi_edges.kernels.edgel_grid import EdgelGrid, cells_around
 from taichi_edges.kernels.points import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D, blocks_of, load_camera, load_point
 from taichi_edges.views.cameras import NEAR
 from taichi_edges.views.edgels import MOST_SINE
@@ -162,10 +162,7 @@ def project_line(camera, point, direction):
 def nearest_edgel(view, pixel, along, radius, most_sine, rows, columns, starts: ti.template(), elements: ti.template()):
     """Index in `elements` of the edgel nearest to a pixel that runs along the unit vector `along`; -1 where none is."""
     nearest, best = -1, radius * radius
-    first_column = ti.max(ti.cast(ti.floor((pixel[0] - radius) / CELL), ti.i32), 0)
-    last_column = ti.min(ti.cast(ti.floor((pixel[0] + radius) / CELL), ti.i32), columns - 1)
-    first_row = ti.max(ti.cast(ti.floor((pixel[1] - radius) / CELL), ti.i32), 0)
-    last_row = ti.min(ti.cast(ti.floor((pixel[1] + radius) / CELL), ti.i32), rows - 1)
+    first_row, last_row, first_column, last_column = cells_around(pixel, radius, rows, columns)
     for row in range(first_row, last_row + 1):
         line = (view * rows + row) * columns
         for element in range(starts[line + first_column], starts[line + last_column + 1]):

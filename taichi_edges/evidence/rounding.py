@@ -15,8 +15,9 @@ import taichi as ti
 
 from taichi_edges.evidence.edgel_matching import EdgelMatching, is_inside, project_line
 from taichi_edges.kernels.device import download, upload
-from taichi_edges.kernels.edgel_grid import CELL
+from taichi_edges.kernels.edgel_grid import cells_around
 from taichi_edges.kernels.points import F32_2D, F32_3D, I32_1D, blocks_of, load_camera, load_point
+from taichi_edges.views.cameras import Cameras
 
 AROUND_PX = 8.0  # edgels so far to the side of a place are looked at
 MOST_AROUND = 6  # of them in each view
@@ -25,7 +26,6 @@ MOST_SINE = 0.2  # of their angle with the line, 12 degrees: a contour keeps bes
 LEAST_RADIUS_PX, RADIUS_STEP, RADII = 1.5, 1.06, 64  # to 60 px; of smaller ones the contour stays within a pixel
 DIRECTIONS = 72  # from which the line is the contour, 5 degrees apart
 GROWING = 0.06  # of how far a contour has moved: radii and directions that are tried are no closer
-QUARTER = np.pi / 2  # of a turn, from which on the surface hides its contour
 UNKNOWN = 1e9
 
 
@@ -82,10 +82,7 @@ def offsets_around(
                     if across.dot(side) < 0:
                         across = -across
                     count = 0
-                    first_column = ti.max(ti.cast(ti.floor((pixel_at[0] - AROUND_PX) / CELL), ti.i32), 0)
-                    last_column = ti.min(ti.cast(ti.floor((pixel_at[0] + AROUND_PX) / CELL), ti.i32), columns - 1)
-                    first_row = ti.max(ti.cast(ti.floor((pixel_at[1] - AROUND_PX) / CELL), ti.i32), 0)
-                    last_row = ti.min(ti.cast(ti.floor((pixel_at[1] + AROUND_PX) / CELL), ti.i32), rows - 1)
+                    first_row, last_row, first_column, last_column = cells_around(pixel_at, AROUND_PX, rows, columns)
                     for row in range(first_row, last_row + 1):
                         line = (view * rows + row) * columns
                         for element in range(starts[line + first_column], starts[line + last_column + 1]):
@@ -145,12 +142,10 @@ def rounding_at(matching: EdgelMatching, points: np.ndarray, directions: np.ndar
     count, views = len(points), matching.edgels.view_count
     offsets = upload(np.full((count, views, MOST_AROUND), UNKNOWN, np.float32))
     angles = upload(np.zeros((count, views), np.float32))
-    projections = matching.projections
-    centres = -np.linalg.solve(projections[:, :, :3], projections[:, :, 3:])[:, :, 0]
     places, ways = (upload(np.ascontiguousarray(array, np.float32)) for array in (points, directions))
     grid = (matching.grid.rows, matching.grid.columns, matching.grid.starts, matching.grid.elements)
     if count:
-        centres = upload(centres.astype(np.float32))
+        centres = upload(Cameras.of(matching.projections).centres.astype(np.float32))
         scene = (matching.cameras, centres, *matching.size, *grid, matching.pixel)
         offsets_around(*blocks_of(places), places, ways, *scene, offsets, angles)
     offsets, angles = download(offsets), download(angles)

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
+import taichi as ti
 
 from taichi_edges.kernels.device import upload
 
@@ -31,3 +32,13 @@ class EdgelGrid:
         self.elements = upload(elements.astype(np.float32))
         self.strengths = upload(edgels.strengths[order].astype(np.float32))
         self.order = np.append(order.astype(np.int32), np.int32(-1))
+
+
+@ti.func
+def cells_around(pixel, radius, rows, columns):
+    """First and last row, first and last column of the cells that hold the edgels within `radius` px of a pixel."""
+    first_column = ti.max(ti.cast(ti.floor((pixel[0] - radius) / CELL), ti.i32), 0)
+    last_column = ti.min(ti.cast(ti.floor((pixel[0] + radius) / CELL), ti.i32), columns - 1)
+    first_row = ti.max(ti.cast(ti.floor((pixel[1] - radius) / CELL), ti.i32), 0)
+    last_row = ti.min(ti.cast(ti.floor((pixel[1] + radius) / CELL), ti.i32), rows - 1)
+    return first_row, last_row, first_column, last_column

@@ -20,7 +20,7 @@ import taichi as ti
 from taichi_edges.kernels.device import download, threads, upload
 from taichi_edges.kernels.points import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D
 from taichi_edges.seeding.boxes import through_box
-from taichi_edges.views.cameras import NEAR, SWEPT_FROM
+from taichi_edges.views.cameras import NEAR, SWEPT_FROM, Cameras
 from taichi_edges.views.views import Views
 
 if TYPE_CHECKING:
@@ -273,7 +273,7 @@ class Rays:
         own, projections = edgels.views, views.intrinsics @ views.world_to_camera
         points, normals = edgels.points.astype(np.float64), edgels.normals.astype(np.float64)
         inverse = np.linalg.inv(projections[:, :, :3])
-        centres = -np.einsum("vij,vj->vi", inverse, projections[:, :, 3])
+        centres = Cameras.of(projections).centres
         directions = np.einsum("nij,nj->ni", inverse[own], np.column_stack([points, np.ones(len(points))]))
         lines = np.column_stack([normals, -(normals * points).sum(axis=1)])
         return Rays(directions, np.einsum("nj,njk->nk", lines, projections[own]), centres, projections)

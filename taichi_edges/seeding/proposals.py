@@ -6,7 +6,6 @@ in all views; the next one counts what is left. Where others have taken its edge
 """
 
 import heapq
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -38,23 +37,18 @@ MOST_COUNTED = 8.0  # views: more do not make an edge surer, and shall not let o
 LONGEST_GAP = 3  # points without support in the middle of a stroke
 
 
-@dataclass(frozen=True)
-class Proposals:
-    """strokes: Strokes. noise_px: standard deviation of edgels across their edge."""
+def propose(views: Views, matching: EdgelMatching, report: "Callable[[int], None] | None" = None) -> Strokes:
+    """The Strokes that explain the edgels of Views. ti.init must have been called.
 
-    strokes: Strokes
-    noise_px: float
-
-
-def propose(views: Views, matching: EdgelMatching, report: "Callable[[int], None] | None" = None) -> Proposals:
-    """The Proposals of Views. ti.init must have been called. report: called with the number of views that are done."""
+    report: called with the number of views that are done.
+    """
     noise = noise_of_views(views, matching)
     lifted = lift_edgels(views, LIFT_NOISES * noise, report=report)
     strokes = traced(views, lifted, ordered_paths(matching.edgels), LIFT_NOISES * noise)
     radii = tuple(noise * factor for factor in RADII_NOISES)
     placed = refine_points(matching, strokes.points, strokes.directions, radii, SCALE_NOISES * noise)
     strokes = Strokes(placed.points, placed.directions, strokes.edgels, strokes.numbers)
-    return Proposals(explaining(matching, strokes, noise), noise)
+    return explaining(matching, strokes, noise)
 
 
 def noise_of_views(views: Views, matching: EdgelMatching) -> float:
