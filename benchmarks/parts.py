@@ -47,6 +47,7 @@ FOUND = 0.8  # of a true edge, to be found
 LENGTHS = (0.0, 0.01, 0.02, 0.05, 0.1, 9.0)  # of true edges: classes
 CHORDS = 400  # of a piece, that is sampled evenly then
 BINS = 10  # of confidences
+LIKELY = 0.5  # confidence of the edges that are kept
 SHEET_PX, SHEET_VIEWS = 640, 3
 
 
@@ -279,9 +280,17 @@ def print_fitted(done: list[Job], out: Path, data: Path | None, pool: ProcessPoo
         b = fitted(others)
         marks, right, length = (column[~found[job][3]] for column in found[job][:3])
         likely = 1 / (1 + np.exp(-(marks @ b[:-1] + b[-1])))
-        rows.append([job.name, calibration_error(np.column_stack([likely, length, right]))])
-    print("\nExpected calibration error of each scene, by weights fitted to the others:\n")
-    print(table(["scene", "error"], rows))
+        kept = (length * right)[likely >= LIKELY].sum()
+        shares = kept / max(length[likely >= LIKELY].sum(), 1e-9), kept / max((length * right).sum(), 1e-9)
+        f = 2 * shares[0] * shares[1] / max(sum(shares), 1e-9)
+        rows.append([job.name, calibration_error(np.column_stack([likely, length, right])), *shares, f])
+    scenes, groups = list(rows), {"of parts": "parts", "of hard parts": "hard", "of known scenes": "known"}
+    for name, group in groups.items():
+        some = [row[1:] for row, job in zip(scenes, first, strict=True) if job.group == group]
+        rows += [[f"mean {name}", *np.mean(some, axis=0)]] if some else []
+    print("\nEach scene by weights fitted to the others: expected calibration error; shares of the length kept that is")
+    print("right and of the right length that is kept, and their harmonic mean:\n")
+    print(table(["scene", "error", "right", "kept", "F"], rows))
 
 
 # Sheets ---------------------------------------------------------------------------------------------------------------

@@ -106,9 +106,8 @@ def views_of(
                 points.append(places + noise_px * across * edgel_errors(places, generator, errors)[:, None])
                 normals.append(across)
         points, normals = np.concatenate(points), np.concatenate(normals)
-        of_views.append(
-            (points, normals, np.full(len(points), strength), np.full(len(points), np.nan if blur is None else blur))
-        )
+        others = (strength, np.nan if blur is None else blur, False)
+        of_views.append((points, normals, *(np.full(len(points), value) for value in others)))
     return Views(
         views.names,
         views.edge_maps,

@@ -13,7 +13,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -25,10 +25,11 @@ from scipy.spatial import cKDTree
 
 from taichi_edges.corridor.command import print_summary
 from taichi_edges.corridor.evaluate import evaluate
-from taichi_edges.corridor.findings import FINDINGS
+from taichi_edges.corridor.findings import CAUSES, DOUBTS, FINDINGS, doubt_of_refine
 from taichi_edges.corridor.loading import load_scene
 from taichi_edges.corridor.pipeline import STAGES, Run, run_stages
 from taichi_edges.errors import UserError
+from taichi_edges.evidence.verdict import MARKS
 from taichi_edges.files import artefacts
 from taichi_edges.files.artefacts import digest_file, remove_unfinished, replacing
 from taichi_edges.files.point_cloud import read_oriented_points
@@ -378,8 +379,22 @@ def test_every_stage_can_say_what_it_found():
     refined = {"edges": 1, "vertices": 2, **asdict(RefineCounts(duplicates=1, unsupported=2))}
     left_out = "left out: 1 duplicate, 2 edges without support in the images"
     assert FINDINGS["refine"](refined) == f"1 edge, 2 vertices; {left_out}"
+    doubted = asdict(RefineCounts(doubted={"blur": 2, "sharpness": 1}))
+    left_out = "left out: 1 contour of a rounded surface, 2 rounded or blurred edges"
+    assert FINDINGS["refine"]({"edges": 1, "vertices": 2, **doubted}) == f"1 edge, 2 vertices; {left_out}"
     anchored = "1 edge, 2 vertices; 2 lines anchored to edges that they meet"
     assert FINDINGS["refine"]({"edges": 1, "vertices": 2, **asdict(RefineCounts(anchored=2))}) == anchored
+
+
+def test_a_bad_result_is_said_to_be_one_with_its_likely_cause():
+    assert list(DOUBTS) == list(CAUSES) and set(DOUBTS) == set(MARKS)
+    good = RefineCounts(likely_percent=97.0, shown_percent=90.0, doubted={"blur": 30})
+    assert doubt_of_refine(asdict(good)) == doubt_of_refine(asdict(RefineCounts())) == ""
+    for worse in ({"likely_percent": 70.0}, {"shown_percent": 50.0}):
+        said = doubt_of_refine(asdict(replace(good, doubted={"blur": 3, "sharpness": 30}, **worse)))
+        assert "30 contours of rounded surfaces" in said and "\n" not in said
+    nothing = doubt_of_refine(asdict(replace(good, shown_percent=50.0, doubted={})))
+    assert nothing == "about 3 % of the edges' length is likely wrong, and 50 % of what the pictures show is on no edge"
 
 
 # --------------------------------------------------------------------------------------- skipping and running again

@@ -64,7 +64,7 @@ def test_lines_are_found_to_a_tenth_of_a_pixel_whatever_their_angle_and_contrast
     errors = []
     for angle in generator.uniform(0, 2 * np.pi, 12):
         share, distance = half_plane(angle, generator.uniform(42, 54, 2))
-        points, normals, strengths, _ = detect_edgels(mixed(share, *generator.permutation([0.05, 0.9])))
+        points, normals, strengths, *_ = detect_edgels(mixed(share, *generator.permutation([0.05, 0.9])))
         inner = within(points)
         errors.append(distance(points[inner]))
         length = np.ptp(points @ [-np.sin(angle), np.cos(angle)])
@@ -87,7 +87,7 @@ def blurred(angle, centre, sigma):
 
 def blurs_of(picture):
     """Blurs of the edgels that are not near the border."""
-    points, _, _, blurs = detect_edgels(picture)
+    points, _, _, blurs, _ = detect_edgels(picture)
     assert len(points) == len(blurs) > 0.7 * SIZE
     return blurs[within(points)]
 
@@ -129,7 +129,8 @@ def test_outlines_of_straight_alpha_are_not_biased_and_need_no_background(light,
     colours = np.full((SIZE, SIZE, 3), encoded(light))
     colours[share < 0.004] = generator.integers(0, 256, (SIZE, SIZE, 3), dtype=np.uint8)[share < 0.004]  # garbage
     picture = np.dstack([colours, np.rint(255 * share).astype(np.uint8)])
-    points, _, strengths, _ = detect_edgels(picture)
+    points, normals, strengths, _, outlines = detect_edgels(picture)
+    assert outlines.all() and (distance(points + normals) > distance(points)).all()  # normals point to the object
     errors = distance(points[within(points)])
     assert len(errors) > 0.6 * (SIZE - 2 * BORDER)
     assert np.abs(errors).max() < 0.1
@@ -142,8 +143,9 @@ def test_a_faint_crease_beside_the_outline_is_found():
     crease, from_crease = half_plane(0.3, (43.2, 47.9))
     light = 0.50 + 0.03 * crease
     picture = np.dstack([encoded(light)] * 3 + [np.rint(255 * share).astype(np.uint8)])
-    points, *_ = detect_edgels(picture)
+    points, *_, outlines = detect_edgels(picture)
     on_crease = np.abs(from_crease(points)) < 1
+    assert not outlines[on_crease].any() and outlines[~on_crease].all()
     assert on_crease.sum() > 0.8 * SIZE
     assert np.abs(np.median(from_crease(points[on_crease]))) < 0.1
     assert (np.minimum(np.abs(from_crease(points)), np.abs(distance(points))) < 0.3).all()
@@ -183,6 +185,26 @@ def test_two_edges_three_pixels_apart_are_two(lights):
         near = np.abs(errors) < 0.5
         assert near.sum() > 60
         assert np.median(np.abs(errors[near])) < 0.1
+
+
+@pytest.mark.parametrize("width", [1.5, 2.0, 2.5])
+@pytest.mark.parametrize("ratio", [1.0, 0.6])
+def test_both_sides_of_a_thin_line_are_found_where_they_are(width, ratio, generator):
+    """Their blurs overlap: the gradient's maxima are never less than two blurs, 1.7 px, apart, here 2.1 to 2.6."""
+    errors, blurs = [], []
+    for angle in generator.uniform(0, 2 * np.pi, 8):
+        across, middle = np.array([np.cos(angle), np.sin(angle)]), generator.uniform(46, 50, 2)
+        first, second = (half_plane(angle, middle + side * across * width / 2) for side in (-1, 1))
+        points, *_, blur, _ = detect_edgels(encoded(0.3 + 0.4 * first[0] - 0.4 * ratio * second[0]))
+        inner = within(points)
+        side = (points[inner] - middle) @ across > 0
+        errors.append(np.where(side, second[1](points[inner]), -first[1](points[inner])))  # outwards
+        blurs.append(blur[inner])
+    errors = np.concatenate(errors)
+    assert len(errors) > 8 * 100  # both sides
+    assert abs(np.median(errors)) < 0.17 and np.quantile(np.abs(errors), 0.9) < 0.35
+    if width < 2.5:
+        assert np.isnan(np.concatenate(blurs)).mean() > 0.6  # how wide a maximum is does not tell anything here
 
 
 def test_blank_pictures_shading_and_its_rounding_give_nothing():

@@ -1,12 +1,25 @@
 """How likely an edge is one: edges, contours and rounded edges are told apart."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from edgel_scenes import CylinderContour, arc, centre, line, views_of
+from scipy.spatial import cKDTree
 
 from taichi_edges.evidence.edgel_matching import EdgelMatching
-from taichi_edges.evidence.verdict import FITTED, MARKS, MOST_BLUR_PX, PRIOR, SHARP_PX, marks_of, probabilities
+from taichi_edges.evidence.verdict import (
+    FITTED,
+    MARKS,
+    MOST_BLUR_PX,
+    MOST_OUTSIDE_PX,
+    PRIOR,
+    SHARP_PX,
+    marks_of,
+    probabilities,
+)
 from taichi_edges.geometry.shapes import Line
+from taichi_edges.views.edgels import Edgels
 
 A = line([0.2, 0.3, 0.3], [0.8, 0.35, 0.4])
 RIM = arc([0.5, 0.5, 0.6], 0.25)
@@ -55,7 +68,7 @@ def test_marks_are_what_they_say(taichi, generator):
     curves = [A, contour.seen_from(centre(views, 3)), nothing]
     marks = marks_of(EdgelMatching(views), [shape(curve) for curve in curves], NOISE_PX)
     assert marks.shape == (3, len(MARKS)) and len(FITTED.marks) == len(MARKS)
-    steadiness, blur, spread, sharpness = marks.T
+    steadiness, blur, spread, sharpness, _ = marks.T
     most = 24 / (24 + PRIOR)  # all views say yes
     assert steadiness[0] > 0.95 * most and steadiness[1] < 0.8 and sharpness[0] > 0.95 * most and sharpness[1] < 0.6
     assert blur[0] == pytest.approx(0.5 - SHARP_PX) and blur[2] == MOST_BLUR_PX - SHARP_PX
@@ -70,15 +83,42 @@ def test_two_edges_beside_each_other_do_not_speak_against_each_other(taichi, gen
     assert verdicts(views, *pair).min() > 0.8
 
 
+def with_outline(views, curve, inwards):
+    """The views, the edgels on a curve marked as on the outline of an object that lies `inwards`, (3,), of it."""
+    columns = []
+    for view in range(len(views)):
+        points, normals, strengths = views.edgels.of_view(view)
+        places, inner = (views.project(curve(np.linspace(0, 1, 500)) + step, view)[0] for step in (0, inwards))
+        distances, nearest = cKDTree(places).query(points)
+        towards = ((inner - places)[nearest] * normals).sum(axis=1, keepdims=True)
+        on = distances < 3 * NOISE_PX
+        columns.append((points, normals * np.where(towards < 0, -1, 1), strengths, np.zeros(len(points)), on))
+    return replace(views, edgels=Edgels.of_views(columns))
+
+
+def test_what_lies_outside_of_the_outline_is_hardly_an_edge(taichi, generator):
+    """As the line does about which the contours of a round lie. Without outlines nothing is outside."""
+    views, outside = views_of([A, RIM], generator, apart=1.0, blur=0.0), MARKS.index("outside")
+    inwards = np.array([0.0, 0.0, PIXEL])
+    beyond = Line(A(np.array([0.0, 1.0])) - 0.3 * inwards)
+    plain, outlined = (
+        marks_of(EdgelMatching(some), [shape(A), beyond], NOISE_PX) for some in (views, with_outline(views, A, inwards))
+    )
+    assert (plain[:, outside] == 0).all()
+    assert outlined[0, outside] < 0.05 and 0.15 < outlined[1, outside] <= MOST_OUTSIDE_PX
+    np.testing.assert_allclose(np.delete(outlined, outside, axis=1), np.delete(plain, outside, axis=1), atol=1e-6)
+    assert probabilities(outlined)[1] < 0.5 * probabilities(plain)[1]
+
+
 def test_no_edges_get_no_verdict(taichi, generator):
     marks = marks_of(EdgelMatching(views_of([A], generator, count=4)), [], NOISE_PX)
     assert marks.shape == (0, len(MARKS)) and probabilities(marks).shape == (0,)
 
 
 def test_probabilities_rise_with_what_speaks_for_an_edge():
-    sure, doubtful = np.array([[1.0, 0.0, 0.5, 1.0]]), np.array([[0.3, 0.5, 0.0, 0.3]])
+    sure, doubtful = np.array([[1.0, 0.0, 0.5, 1.0, 0.0]]), np.array([[0.3, 0.5, 0.0, 0.3, 0.0]])
     assert probabilities(sure)[0] > 0.95 and probabilities(doubtful)[0] < 0.01
-    for mark, sign in zip(range(len(MARKS)), (1, -1, 1, 1), strict=True):
+    for mark, sign in zip(range(len(MARKS)), (1, -1, 1, 1, -1), strict=True):
         more = sure.copy()
         more[0, mark] += 0.1
         assert np.sign(probabilities(more) - probabilities(sure))[0] == sign

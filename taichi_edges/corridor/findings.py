@@ -8,6 +8,24 @@ from taichi_edges.errors import amount
 WRONG_CAMERAS = "poses or intrinsics may not be those of these images (their order, axes or scale)"
 
 
+# What each mark of `evidence/verdict.py` that speaks against an edge says about it: in the singular, and in the plural.
+DOUBTS = {
+    "steadiness": ("edge that moves with the viewpoint", "edges that move with the viewpoint"),
+    "sharpness": ("contour of a rounded surface", "contours of rounded surfaces"),
+    "outside": ("edge outside of the object's outline", "edges outside of the object's outline"),
+    "blur": ("rounded or blurred edge", "rounded or blurred edges"),
+    "spread": ("edge seen from too few sides", "edges seen from too few sides"),
+}
+CAUSES = {
+    "steadiness": "they may be contours of rounded surfaces, which move with the viewpoint, or the poses are off",
+    "sharpness": "contours of rounded surfaces move with the viewpoint and are no edges",
+    "outside": "contours of rounded edges lie there, or the transparency of the pictures is off",
+    "blur": "edges may be rounded, or the pictures out of focus",
+    "spread": "take more pictures from other sides",
+}
+DOUBTFUL = 0.85  # harmonic mean of the shares that are likely right and shown: results below are 67 % right or found
+
+
 def left_out(*amounts: tuple[int, str] | tuple[int, str, str]) -> str:
     """'; left out: 3 outliers, 1 point': the (count, noun, plural) that are not zero, '' where all are."""
     named = [amount(*each) for each in amounts if each[0]]
@@ -86,10 +104,26 @@ def describe_refine(facts: Mapping[str, Any]) -> str:
         + (f"; {changed}" if changed else "")
         + left_out(
             (facts["duplicates"], "duplicate"),
+            *((facts["doubted"][mark], *name) for mark, name in DOUBTS.items() if mark in facts["doubted"]),
             (facts["unsupported"], "edge without support in the images", "edges without support in the images"),
         )
         + describe_relations(facts["relations"])
     )
+
+
+def doubt_of_refine(facts: Mapping[str, Any]) -> str:
+    """What to say where the edges are not to be trusted, with the likely cause: one line; '' where they are."""
+    if facts["likely_percent"] is None:
+        return ""
+    likely, shown = facts["likely_percent"] / 100, facts["shown_percent"] / 100
+    if 2 * likely * shown >= DOUBTFUL * (likely + shown):
+        return ""
+    wrong = f"about {100 * (1 - likely):.0f} % of the edges' length is likely wrong"
+    line = f"{wrong}, and {100 * (1 - shown):.0f} % of what the pictures show is on no edge"
+    if not facts["doubted"]:
+        return line
+    mark = max(facts["doubted"], key=lambda mark: (facts["doubted"][mark], mark))
+    return f"{line}; left out above all: {amount(facts['doubted'][mark], *DOUBTS[mark])}: {CAUSES[mark]}"
 
 
 def describe_relations(relations: Mapping[str, tuple[int, int]]) -> str:

@@ -3,6 +3,7 @@
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+from taichi_edges.corridor.findings import doubt_of_refine
 from taichi_edges.errors import amount
 from taichi_edges.geometry.wireframe import wireframe_and_about, write_wireframe
 from taichi_edges.views.views import read_views
@@ -28,4 +29,8 @@ def refine(run: "Run") -> dict[str, Any]:
     write_wireframe(
         run.path("edges.json"), wireframe.transformed(views.similarity.to_input, 1.0 / views.similarity.scale), about
     )
-    return {"edges": len(wireframe), "vertices": len(wireframe.vertices), **asdict(counts)}
+    facts = {"edges": len(wireframe), "vertices": len(wireframe.vertices), **asdict(counts)}
+    doubt = doubt_of_refine(facts)
+    if doubt:
+        run.progress.warn(doubt)
+    return facts

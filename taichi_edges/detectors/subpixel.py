@@ -18,7 +18,7 @@ A coarse scale adds what the finer ones did not find: edges that drown in noise,
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
@@ -27,6 +27,7 @@ import numpy as np
 
 from taichi_edges.arrays.columns import Columns
 from taichi_edges.arrays.components import components
+from taichi_edges.detectors.close_edges import disentangled
 from taichi_edges.detectors.ridges import gaussian_derivatives
 from taichi_edges.views.edgels import Edgels
 from taichi_edges.views.pictures import Picture, as_picture, levels_per_light, read_picture
@@ -88,7 +89,7 @@ class Maxima(Columns):
 
     rows, columns: (n,) their pixels. points: (n, 2) pixels (u, v). normals: (n, 2) unit, towards more light.
     ratios: (n,) how far they stand out of what is beside them, in units of the clutter. widths: (n,) px^2, variance of
-    the gradient's profile across the edge, a Gaussian where the edge is a blurred step.
+    the gradient's profile across the edge, a Gaussian where the edge is a blurred step. steepness: (n,) the gradient.
     """
 
     rows: np.ndarray
@@ -97,6 +98,7 @@ class Maxima(Columns):
     normals: np.ndarray
     ratios: np.ndarray
     widths: np.ndarray
+    steepness: np.ndarray
 
 
 def trace_pictures(
@@ -114,7 +116,7 @@ def trace_pictures(
 
     def trace(path: Path | str) -> tuple[tuple[np.ndarray, ...], tuple[int, int] | None]:
         if not path:
-            return _arrays([], []), None
+            return _arrays([], False), None
         picture = read_picture(path, exponent)
         height, width = picture.light.shape[:2]
         return detect_edgels(picture), (width, height)
@@ -132,39 +134,42 @@ def trace_pictures(
     return Edgels.of_views(views), sizes
 
 
-def detect_edgels(image: Picture | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def detect_edgels(image: Picture | np.ndarray) -> tuple[np.ndarray, ...]:
     """Edgels of one image: a Picture, or an array that `as_picture` accepts.
 
     Returns points (n, 2) as (u, v), pixel centres at integers, 0.7 to 1.4 for each pixel of an edge's length; unit
     normals (n, 2) across the edge, towards more light; strengths (n,) in 0..1: r / (r + HALF_SURE) for an edge that
     stands out r times from the clutter around it. The faintest have about 0.2, and clear ones more than 0.5. And blurs
-    (n,), see `Edgels`.
+    (n,) and outlines (n,), see `Edgels`.
     """
     picture = image if isinstance(image, Picture) else as_picture(image)
     shape = picture.light.shape[:2]
     if min(shape) <= 2 * MARGIN:
-        return _arrays([], [])
+        return _arrays([], False)
     taken = np.zeros(shape, bool)  # pixels with an edgel
     layers: list[Maxima] = []
-    blurs: list[float] = []
     for field in _fields(picture):
         edges, runs = _chained(_maxima(field, _clutter(field)), shape, field.blur)
+        shifts, alone = disentangled(edges.points, edges.normals, edges.steepness, field.blur)
+        widths = np.where(alone, edges.widths - field.blur**2, np.nan)
+        edges = replace(edges, points=edges.points + shifts[:, None] * edges.normals, widths=widths)
         free = ~_beside_taken(taken, edges, 1.5 * field.sigma)
         layers.append(edges.keep(_long_runs(free, runs)))
         taken[layers[-1].rows, layers[-1].columns] = True
-        blurs.append(field.blur)
-    return _arrays(layers, blurs)
+    return _arrays(layers, picture.coverage is not None)
 
 
-def _arrays(layers: list[Maxima], blurs: list[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Points (n, 2), normals (n, 2), strengths (n,) and blurs (n,) of several Maxima. blurs: px, of their Fields."""
+def _arrays(layers: list[Maxima], outlined: bool) -> tuple[np.ndarray, ...]:
+    """The columns of `detect_edgels`. outlined: the first of the layers is that of the outline."""
     points, normals = (
         np.concatenate([np.zeros((0, 2)), *(getattr(layer, name) for layer in layers)])
         for name in ("points", "normals")
     )
     ratios = np.concatenate([np.zeros(0), *(layer.ratios for layer in layers)]).clip(min=0.0)
-    own = [np.sqrt(np.maximum(layer.widths - blur**2, 0.0)) for layer, blur in zip(layers, blurs, strict=True)]
-    return points, normals, ratios / (ratios + HALF_SURE), np.concatenate([np.zeros(0), *own])
+    own = [np.sqrt(np.maximum(layer.widths, 0.0)) for layer in layers]
+    on_outline = [np.full(len(layer), outlined and layer is layers[0]) for layer in layers]
+    blurs, outlines = np.concatenate([np.zeros(0), *own]), np.concatenate([np.zeros(0, bool), *on_outline])
+    return points, normals, ratios / (ratios + HALF_SURE), blurs, outlines
 
 
 def _fields(picture: Picture) -> Iterator[Field]:
@@ -252,7 +257,7 @@ def _maxima(field: Field, clutter: np.ndarray) -> Maxima:
     points = np.stack([columns, rows], axis=1).astype(np.float32) + offsets[:, None] * normals
     standing_out = size - _beside(field, rows, columns, normals)
     ratios = standing_out * (field.levels / clutter)[rows, columns]
-    return Maxima(rows, columns, points, normals, ratios, widths).keep(ratios > LOW)
+    return Maxima(rows, columns, points, normals, ratios, widths, size).keep(ratios > LOW)
 
 
 def _candidates(field: Field, squares: np.ndarray, clutter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -336,7 +341,8 @@ def _chained(maxima: Maxima, shape: tuple[int, ...], blur: float) -> tuple[Maxim
     kept = goes_on & (np.bincount(runs, votes)[runs] >= ENOUGH)
     shifts = 0.5 * blur**2 * _curvatures(maxima, low, high - 1)
     points = maxima.points + shifts[:, None] * maxima.normals
-    smoothed = Maxima(maxima.rows, maxima.columns, points, maxima.normals, mean(maxima.ratios), mean(maxima.widths))
+    means = mean(maxima.ratios), mean(maxima.widths), mean(maxima.steepness)
+    smoothed = Maxima(maxima.rows, maxima.columns, points, maxima.normals, *means)
     return smoothed.keep(kept), runs[kept]
 
 

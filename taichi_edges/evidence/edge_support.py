@@ -14,7 +14,7 @@ from scipy.special import gammainc
 from taichi_edges.arrays.robust import NORMAL_MAD, geman_mcclure
 from taichi_edges.evidence.edgel_matching import EdgelMatching
 from taichi_edges.evidence.lying import EdgelsAbout, steadiness
-from taichi_edges.evidence.noise import BEST_SUPPORTED
+from taichi_edges.evidence.noise import BEST_SUPPORTED, noise_of_best_agreeing
 from taichi_edges.geometry.shapes import Shape
 from taichi_edges.geometry.wireframe import Evidence
 from taichi_edges.views.edgels import MOST_SINE
@@ -168,6 +168,11 @@ class Support:
         for _ in range(CORE_ROUNDS if len(residuals) else 0):
             noise = float(NORMAL_MAD * np.median(residuals[residuals <= max(CORE * noise, residuals.min())]))
         return noise if len(residuals) else 0.0
+
+    @cached_property
+    def least_noise_px(self) -> float:
+        """`noise_px` of the samples whose edgels agree best, at most that of all."""
+        return min(self.noise_px, noise_of_best_agreeing(np.where(self.edgels >= 0, self.residuals, np.nan)))
 
     @cached_property
     def supported_lengths(self) -> np.ndarray:

@@ -82,6 +82,22 @@ class EdgelMatching:
         views = [self.edgels.of_view(view) for view in range(self.edgels.view_count)]
         return [(some.sum(), np.prod(np.ptp(points, axis=0) + 1.0)) for points, _, some in views if len(points)]
 
+    @cached_property
+    def outline_grid(self) -> EdgelGrid:
+        """The edgels on outlines, alone."""
+        return EdgelGrid(self.edgels.keep(self.edgels.outlines), *self.size)
+
+    def outside(self, points: np.ndarray, directions: np.ndarray, radius: float) -> np.ndarray:
+        """(n, V) px by which points lie beyond the outline of the object; 0 inside, and where the outline is farther
+        than `radius`. points, directions: (n, 3).
+        """
+        if not self.edgels.outlines.any():
+            return np.zeros((len(points), self.edgels.view_count), np.float32)
+        found, residuals, _ = self._matches(
+            self.outline_grid, points, directions, (0, self.edgels.view_count), radius, 1.0
+        )
+        return np.where(found >= 0, np.maximum(-residuals, 0.0), 0.0)
+
     def equations(self, points: np.ndarray, directions: np.ndarray, radius: float, scale: float) -> PlaneEquations:
         """PlaneEquations of the edgels next to points.
 
@@ -122,15 +138,28 @@ class EdgelMatching:
         Also (n, v) float32, its distance across the edgel, px, signed along the normal; and (n, v) bool, whether the
         view has the point in its image.
         """
-        found = upload(np.full((len(points), views.stop - views.start), -2, np.int32))
+        return self._matches(self.grid, points, directions, (views.start, views.stop), radius, MOST_SINE)
+
+    def _matches(
+        self,
+        edgels: EdgelGrid,
+        points: np.ndarray,
+        directions: np.ndarray,
+        views: tuple[int, int],
+        radius: float,
+        most_sine: float,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`matches` with the edgels of a grid, in the views from the first to before the last."""
+        first, last = views
+        found = upload(np.full((len(points), last - first), -2, np.int32))
         residuals = upload(np.zeros(found.shape, np.float32))
         points, directions = (upload(np.asarray(array, np.float32)) for array in (points, directions))
-        grid = (self.grid.rows, self.grid.columns, self.grid.starts, self.grid.elements)
-        gates = float(radius), MOST_SINE
+        grid = (edgels.rows, edgels.columns, edgels.starts, edgels.elements)
+        gates = float(radius), float(most_sine)
         if points.shape[0]:
             find_matches(
                 *blocks_of(points),
-                views.start,
+                first,
                 points,
                 directions,
                 self.cameras,
@@ -141,7 +170,7 @@ class EdgelMatching:
                 residuals,
             )
         found = download(found)
-        return self.grid.order[np.maximum(found, -1)], download(residuals), found > -2
+        return edgels.order[np.maximum(found, -1)], download(residuals), found > -2
 
 
 @ti.func

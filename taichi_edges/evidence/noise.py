@@ -25,6 +25,21 @@ SCALE_NOISES = 2.1  # residual at which an edgel's weight has fallen to a quarte
 RADII_NOISES = (8.5, 7.0, 5.0)  # of the edgels looked at while points are moved to their edge, round by round
 ON_NOISES = 4.7  # within so much an edgel is an edge's
 TAKEN_NOISES = 2.2  # and within so much nobody else's: an edge may run beside another
+BEST_AGREEING = 0.25  # share of the places that are on edges, even if most are on contours
+LEAST_VIEWS, LEAST_PLACES = 6, 20  # so many views of a place tell by how much they agree, and so many places
+
+
+def noise_of_best_agreeing(residuals: np.ndarray) -> float:
+    """Standard deviation, px, of (n, V) residuals, NaN where there are none, of the places whose views agree best.
+
+    Where most of what the views show are contours of rounded surfaces, the residuals of all are theirs. Infinite where
+    too few views tell it.
+    """
+    counts = np.isfinite(residuals).sum(axis=1)
+    some = counts >= max(LEAST_VIEWS, np.median(counts) if len(counts) else 0)
+    if np.count_nonzero(some) < LEAST_PLACES:
+        return np.inf
+    return NORMAL_MAD * float(np.quantile(np.nanmedian(np.abs(residuals[some]), axis=1), BEST_AGREEING))
 
 
 def noise_of(matching: "EdgelMatching", placed: "RefinedPoints") -> float:

@@ -34,7 +34,13 @@ MOST_BLUR_PX = 0.75  # more says no more
 ENOUGH_SPREAD = 0.5  # sine of the angle between viewing planes, 30 degrees: more says no more
 PRIOR = 2.0  # views that say no, added to all: of two or three that agree the share that does is no certainty
 PLACES, PLACE_PX = 4, 4.0  # of an edge, where radii are tried: at most so many, so far apart at least
-MARKS = ("steadiness", "blur", "spread", "sharpness")
+OUTLINE_PX = 6.0  # so far about a place the outline of the object is looked for
+OUTSIDE_VIEWS = 2  # that must show a place outside of it: a single outline may be wrong
+MOST_OUTSIDE_PX = 0.5  # more says no more
+MARKS = ("steadiness", "blur", "spread", "sharpness", "outside")
+
+HARDLY_STEADY = 0.1  # an edge that no more of the edgels about it lie on is shown by none
+TYPICAL = (0.74, 0.0, 0.5, 0.78, 0.0)  # medians of the MARKS of edges that are right, of the scenes of `--fit-verdict`
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,17 @@ class Weights:
     constant: float
 
 
-FITTED = Weights((3.73, -6.76, 1.62, 6.16), -5.28)  # not chosen: see the module's first lines
+FITTED = Weights((2.24, -6.36, 2.67, 6.93, -5.68), -5.06)  # not chosen: see the module's first lines
+
+
+def reasons(marks: np.ndarray, weights: Weights = FITTED) -> list[str]:
+    """For each of (E, len(MARKS)) marks the name of that which speaks most against an edge, compared with TYPICAL.
+
+    'support' where hardly any edgel lies on it.
+    """
+    against = (marks - np.array(TYPICAL)) * np.array(weights.marks)
+    shown = marks[:, MARKS.index("steadiness")] >= HARDLY_STEADY
+    return [MARKS[number] if seen else "support" for number, seen in zip(against.argmin(axis=1), shown, strict=True)]
 
 
 def probabilities(marks: np.ndarray, weights: Weights = FITTED) -> np.ndarray:
@@ -59,7 +75,8 @@ def marks_of(matching: EdgelMatching, shapes: Sequence[Shape], noise_px: float) 
     steadiness: of the edgels about an edge the share that lies on it, those of another edge beside it left out. blur:
     px, see `Edgels.blurs`, beyond SHARP_PX. spread: sine of the angle by which the viewing planes of its edgels lean
     against each other. sharpness: of the views that the contour of some round surface would explain, see `rounding`,
-    the share that an edge does.
+    the share that an edge does. outside: px by which an edge lies beyond the outline of the object, 0 where pictures
+    show none: the line about which the contours of a round lie is outside, seen along the round.
     """
     return marks_along(matching, EdgeSamples.along(shapes, SPACING_PX * matching.pixel), noise_px)
 
@@ -74,6 +91,7 @@ def marks_along(matching: EdgelMatching, samples: EdgeSamples, noise_px: float) 
     on = own & about.within(tight)
     shown = samples.sums(on.astype(np.float64)) / np.maximum(np.diff(samples.starts), 1)[:, None]  # (E, V)
     seeing = shown >= SHOWN
+    outside = matching.outside(samples.points, samples.directions, OUTLINE_PX)
     marks = np.zeros((count, len(MARKS)))
     for number in range(count):
         part = samples.of(number)
@@ -83,8 +101,9 @@ def marks_along(matching: EdgelMatching, samples: EdgeSamples, noise_px: float) 
             _blur(matching, here, lying, seeing[number]),
             _spread(matching, here, lying, seeing[number]),
             0.0,
+            _outside(outside[part]),
         )
-    marks[:, -1] = _sharpness(matching, samples, tight)
+    marks[:, MARKS.index("sharpness")] = _sharpness(matching, samples, tight)
     return marks
 
 
@@ -155,3 +174,10 @@ def _spread(matching: EdgelMatching, about: EdgelsAbout, on: np.ndarray, mine: n
         normals.append(normal / np.linalg.norm(normal))
     values = np.linalg.eigvalsh(np.einsum("ni,nj->ij", normals, normals))
     return min(float(np.sqrt(max(values[1], 0.0) / max(values[2], 1e-12))), ENOUGH_SPREAD)
+
+
+def _outside(beyond: np.ndarray) -> float:
+    """Px by which an edge lies beyond the outline in the views that show it farthest outside. beyond: (n, V) px."""
+    if not len(beyond) or beyond.shape[1] < OUTSIDE_VIEWS:
+        return 0.0
+    return min(float(np.sort(np.median(beyond, axis=0))[-OUTSIDE_VIEWS]), MOST_OUTSIDE_PX)

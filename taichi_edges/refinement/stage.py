@@ -1,5 +1,6 @@
 """From single edges to a wireframe: connected, minimal, in agreement with the images."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -8,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taichi_edges.evidence.edge_support import (
+    EdgeSamples,
     Support,
     claims_of,
     evidence_of,
@@ -18,8 +20,9 @@ from taichi_edges.evidence.edge_support import (
     support_share,
 )
 from taichi_edges.evidence.edgel_matching import EdgelMatching
-from taichi_edges.evidence.noise import LEAST_NOISE_PX, MOST_NOISE_PX
-from taichi_edges.evidence.verdict import marks_of, probabilities
+from taichi_edges.evidence.lying import EdgelsAbout
+from taichi_edges.evidence.noise import LEAST_NOISE_PX, MOST_NOISE_PX, ON_NOISES
+from taichi_edges.evidence.verdict import marks_of, probabilities, reasons
 from taichi_edges.fitting.model_selection import Yardstick
 from taichi_edges.geometry.shapes import Shape
 from taichi_edges.geometry.wireframe import Wireframe
@@ -53,6 +56,9 @@ class RefineCounts:
     circles: arcs that became whole circles. joined: strokes that became part of others. duplicates: strokes that
     repeated others. anchored: lines that got their depth from edges that they meet. lines: added between vertices.
     unsupported: edges left out as the images do not show them.
+    doubted: {mark: how many edges the verdict left out that it spoke most against}, see `verdict.MARKS`.
+    likely_percent: of the length of the edges, how much the verdict expects to be right; None without a verdict.
+    shown_percent: of the edgels, how many lie on the edges; None without a verdict.
     relations: {kind: (how many were found, how many of these were imposed)}; what those imply is not imposed again.
     """
 
@@ -62,6 +68,9 @@ class RefineCounts:
     anchored: int = 0
     lines: int = 0
     unsupported: int = 0
+    doubted: dict[str, int] = field(default_factory=dict)
+    likely_percent: float | None = None
+    shown_percent: float | None = None
     relations: dict[str, tuple[int, int]] = field(default_factory=dict)
 
 
@@ -78,9 +87,17 @@ def refine_wireframe(loose: Wireframe, views: "Views", config: "RefineConfig") -
     anchored = anchored_lines(matching, shapes) if config.anchor else []
     wireframe, lines = completed(connected([*shapes, *anchored], matching.pixel), matching)
     wireframe, relations = related(adjusted(wireframe, matching), matching, config.regularise)
-    judged = with_evidence(wireframe, matching, config)
-    unsupported = counts.unsupported + len(wireframe) - len(judged)
-    counts = replace(counts, anchored=len(anchored), lines=lines, unsupported=unsupported, relations=relations)
+    judged, doubted, unsupported = with_evidence(wireframe, matching, config)
+    counts = replace(
+        counts,
+        anchored=len(anchored),
+        lines=lines,
+        unsupported=counts.unsupported + unsupported,
+        doubted=dict(Counter(counts.doubted) + doubted),
+        relations=relations,
+    )
+    if config.verdict and len(judged):
+        counts = replace(counts, likely_percent=likely_percent(judged), shown_percent=shown_percent(matching, judged))
     return judged, counts
 
 
@@ -92,14 +109,13 @@ def whole_edges(
     Free ends are extended only when it is known which are free, and then some more strokes continue each other.
     """
     yardstick, seen = yardstick_of(shapes, matching), partial(support_along, matching)
-    likely = not_hopeless(matching, shapes, config)
-    hopeless = len(shapes) - len(likely)
+    likely, hopeless, unseen = not_hopeless(matching, shapes, config)
     shapes, first = continued(likely, yardstick, seen)
-    kept = with_support(matching, shapes, config)
+    kept, doubted, lost = with_support(matching, shapes, config)
     longer, second = continued(with_longer_ends(matching, kept), yardstick, seen, WIDE_GAP_PX)
-    found = with_support(matching, longer, config)
-    unsupported = hopeless + len(shapes) - len(kept) + len(longer) - len(found)
-    return found, RefineCounts(**asdict(first + second), unsupported=unsupported)
+    found, doubted_too, lost_too = with_support(matching, longer, config)
+    counts = asdict(first + second) | {"unsupported": unseen + lost + lost_too}
+    return found, RefineCounts(**counts, doubted=dict(hopeless + doubted + doubted_too))
 
 
 def yardstick_of(shapes: Sequence[Shape], matching: EdgelMatching) -> Yardstick:
@@ -119,39 +135,87 @@ def related(
     return wireframe, {kind: (count, 0) for kind, count in found_relations(wireframe, matching)[0].items()}
 
 
-def with_evidence(wireframe: Wireframe, matching: EdgelMatching, config: "RefineConfig") -> Wireframe:
-    """The Wireframe with what the images say about each edge, and without those they do not support."""
+def with_evidence(
+    wireframe: Wireframe, matching: EdgelMatching, config: "RefineConfig"
+) -> tuple[Wireframe, Counter[str], int]:
+    """The Wireframe with what the images say about each edge, and without those they do not support.
+
+    Also {mark: how many the verdict left out for it}, and how many others were left out.
+    """
     support = support_of(matching, wireframe.shapes)
-    found = evidence_of(support)
+    found, doubts = evidence_of(support), np.full(len(wireframe), "", object)
     if config.verdict:
-        likely = probabilities(marks_of(matching, wireframe.shapes, edgel_noise(support)))
+        likely, doubts = judged_shapes(matching, wireframe.shapes, support, config.min_confidence)
         found = [replace(of, confidence=float(p)) for of, p in zip(found, likely, strict=True)]
     edges = tuple(replace(edge, evidence=of) for edge, of in zip(wireframe.edges, found, strict=True))
-    least = config.min_confidence if config.verdict else LEAST_CONFIDENCE
-    sure = np.array([of.confidence >= least for of in found], dtype=bool)
-    return replace(wireframe, edges=edges).keep(sure & is_edge(matching, support, wireframe.shapes, config))
+    sure = doubts == "" if config.verdict else np.array([of.confidence >= LEAST_CONFIDENCE for of in found], bool)
+    sure &= is_edge(matching, support, wireframe.shapes, config)
+    return replace(wireframe, edges=edges).keep(sure), *left_out(doubts, sure)
+
+
+def left_out(doubts: np.ndarray, kept: np.ndarray) -> tuple[Counter[str], int]:
+    """{mark: how many edges the verdict left out for it}, and how many the images do not support, of (E,) edges."""
+    found = Counter(doubts[~kept])
+    unsupported = found.pop("", 0) + found.pop("support", 0)
+    return found, unsupported
+
+
+def judged_shapes(
+    matching: EdgelMatching, shapes: Sequence[Shape], support: Support, least: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(E,) probabilities that shapes are edges; and (E,) the mark that speaks most against each of those that are less
+    likely than `least`, '' for the others.
+    """
+    marks = marks_of(matching, shapes, edgel_noise(support))
+    likely = probabilities(marks)
+    return likely, np.where(likely >= least, "", np.array(reasons(marks), object))
+
+
+def likely_percent(wireframe: Wireframe) -> float:
+    """Of the length of edges that the verdict has judged, how much it expects to be right."""
+    lengths = np.array([shape.length for shape in wireframe.shapes])
+    confidences = np.array([edge.evidence.confidence for edge in wireframe.edges if edge.evidence])
+    return float(100.0 * (lengths * confidences).sum() / lengths.sum())
+
+
+def shown_percent(matching: EdgelMatching, wireframe: Wireframe) -> float:
+    """Of the edgels of all views, how many lie on the edges."""
+    samples = EdgeSamples.along(wireframe.shapes, matching.pixel)
+    noise = edgel_noise(support_of(matching, wireframe.shapes))
+    about = EdgelsAbout.of(matching, samples.points, samples.directions, ON_NOISES * noise)
+    shown = np.zeros(len(matching.edgels), bool)
+    shown[about.edgels[about.there]] = True
+    return float(100.0 * shown[matching.neighbors].any(axis=1).mean())
 
 
 def edgel_noise(support: Support) -> float:
-    """Standard deviation of the edgels of a Support across their edges, px."""
-    return float(np.clip(support.noise_px, LEAST_NOISE_PX, MOST_NOISE_PX))
+    """Standard deviation of the edgels of a Support across the edges on which they lie best, px."""
+    return float(np.clip(support.least_noise_px, LEAST_NOISE_PX, MOST_NOISE_PX))
 
 
-def not_hopeless(matching: EdgelMatching, shapes: Sequence[Shape], config: "RefineConfig") -> list[Shape]:
-    """The strokes that may be part of an edge: what hardly can would lead others astray, and takes time."""
+def not_hopeless(
+    matching: EdgelMatching, shapes: Sequence[Shape], config: "RefineConfig"
+) -> tuple[list[Shape], Counter[str], int]:
+    """The strokes that may be part of an edge: what hardly can would lead others astray, and takes time.
+
+    The rest as of `with_evidence`.
+    """
     if not config.verdict or not len(shapes):
-        return list(shapes)
-    likely = probabilities(marks_of(matching, shapes, edgel_noise(support_of(matching, shapes))))
-    return [shape for shape, p in zip(shapes, likely, strict=True) if p >= HOPELESS * config.min_confidence]
+        return list(shapes), Counter(), 0
+    _, doubts = judged_shapes(matching, shapes, support_of(matching, shapes), HOPELESS * config.min_confidence)
+    return [shape for shape, doubt in zip(shapes, doubts, strict=True) if not doubt], *left_out(doubts, doubts == "")
 
 
-def with_support(matching: EdgelMatching, shapes: Sequence[Shape], config: "RefineConfig") -> list[Shape]:
-    """The shapes that the images support; their places are not exact yet."""
+def with_support(
+    matching: EdgelMatching, shapes: Sequence[Shape], config: "RefineConfig"
+) -> tuple[list[Shape], Counter[str], int]:
+    """The shapes that the images support; their places are not exact yet. The rest as of `with_evidence`."""
     support = support_of(matching, shapes)
-    kept = is_edge(matching, support, shapes, config, LENIENT)
-    if config.verdict:
-        kept &= probabilities(marks_of(matching, shapes, edgel_noise(support))) >= DOUBTED * config.min_confidence
-    return [shape for shape, keep in zip(shapes, kept, strict=True) if keep]
+    supported, doubts = is_edge(matching, support, shapes, config, LENIENT), np.full(len(shapes), "", object)
+    if config.verdict and len(shapes):
+        _, doubts = judged_shapes(matching, shapes, support, DOUBTED * config.min_confidence)
+    kept = supported & (doubts == "")
+    return [shape for shape, keep in zip(shapes, kept, strict=True) if keep], *left_out(doubts, kept)
 
 
 def is_edge(

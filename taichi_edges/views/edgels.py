@@ -21,6 +21,8 @@ class Edgels:
     strengths: (n,) float32 in 0..1: how sure the detector is.
     blurs:     (n,) float32 pixels: standard deviation of what the edge itself is blurred by in the picture, beyond what
                a pixel blurs; 0 of a sharp one. NaN where that is not known.
+    outlines:  (n,) bool: on the outline of the object, which the transparency of a picture shows. Their normals point
+               to the object.
     """
 
     starts: np.ndarray
@@ -28,22 +30,24 @@ class Edgels:
     normals: np.ndarray
     strengths: np.ndarray
     blurs: np.ndarray
+    outlines: np.ndarray
 
     def __post_init__(self) -> None:
         count = len(self.points)
         assert self.points.shape == self.normals.shape == (count, 2)
-        assert self.strengths.shape == self.blurs.shape == (count,)
+        assert self.strengths.shape == self.blurs.shape == self.outlines.shape == (count,)
         assert self.starts[0] == 0 and self.starts[-1] == count, self.starts
 
     @staticmethod
     def of_views(views: Iterable[tuple[np.ndarray, ...]]) -> "Edgels":
-        """From an iterable with (points, normals, strengths) or (points, normals, strengths, blurs) for each view."""
-        filled = [view if len(view) == 4 else (*view, np.full(len(view[0]), np.nan)) for view in views]
-        columns = list(zip(*filled, strict=True)) or [()] * 4
+        """From an iterable with (points, normals, strengths) for each view, or with all five columns."""
+        filled = [view if len(view) == 5 else (*view, *_unknown(len(view[0]))) for view in views]
+        columns = list(zip(*filled, strict=True)) or [()] * 5
         starts = np.concatenate([[0], np.cumsum([len(points) for points in columns[0]])]).astype(np.int64)
-        shapes = ((0, 2), (0, 2), (0,), (0,))
-        joined = (np.concatenate([np.zeros(shape), *column]) for shape, column in zip(shapes, columns, strict=True))
-        return Edgels(starts, *(np.ascontiguousarray(array, np.float32) for array in joined))
+        shapes = ((0, 2), (0, 2), (0,), (0,), (0,))
+        joined = [np.concatenate([np.zeros(shape), *column]) for shape, column in zip(shapes, columns, strict=True)]
+        points, normals, strengths, blurs = (np.ascontiguousarray(array, np.float32) for array in joined[:4])
+        return Edgels(starts, points, normals, strengths, blurs, joined[4].astype(bool))
 
     @property
     def view_count(self) -> int:
@@ -66,14 +70,22 @@ class Edgels:
     def keep(self, chosen: np.ndarray) -> "Edgels":
         """Only the chosen edgels. chosen: (n,) bool."""
         before = np.concatenate([[0], np.cumsum(chosen)]).astype(np.int64)
-        columns = (self.points, self.normals, self.strengths, self.blurs)
-        return Edgels(before[self.starts], *(column[chosen] for column in columns))
+        return Edgels(before[self.starts], *(column[chosen] for column in self._columns))
 
     def of_some(self, views: Sequence[int]) -> "Edgels":
         """Those of some views, in that order."""
         parts = [slice(self.starts[view], self.starts[view + 1]) for view in views]
-        return Edgels.of_views((*self.of_view(view), self.blurs[part]) for view, part in zip(views, parts, strict=True))
+        return Edgels.of_views(tuple(column[part] for column in self._columns) for part in parts)
+
+    @property
+    def _columns(self) -> tuple[np.ndarray, ...]:
+        return self.points, self.normals, self.strengths, self.blurs, self.outlines
 
     def moved(self, offsets: np.ndarray) -> "Edgels":
         """The same edgels, their points moved by (n, 2) pixels."""
         return replace(self, points=(self.points + offsets).astype(np.float32))
+
+
+def _unknown(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Blurs and outlines of edgels of which neither is known."""
+    return np.full(count, np.nan), np.zeros(count, bool)

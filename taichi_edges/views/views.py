@@ -12,7 +12,7 @@ from taichi_edges.files.artefacts import file_state, replacing
 from taichi_edges.views.cameras import NEAR, Camera, Similarity, project
 from taichi_edges.views.edgels import Edgels
 
-EDGEL_ARRAYS = ("starts", "points", "normals", "strengths", "blurs")  # the fields of Edgels, in order
+EDGEL_ARRAYS = ("starts", "points", "normals", "strengths", "blurs", "outlines")  # the fields of Edgels, in order
 
 
 @dataclass(frozen=True)
