@@ -118,8 +118,8 @@ def _moved_elliptic_arc(arc: EllipticArc, ends: np.ndarray, own: np.ndarray) -> 
     """With half the angle it spans h: centre + u cos t + v sin t, t from -h to h, through ends and middle."""
     half, (first, middle, last) = 0.5 * (arc.high - arc.low), arc.at(np.array([0.0, 0.5, 1.0]))
     rise = np.linalg.norm(middle - 0.5 * (first + last))
-    # A small angle shows by its square alone, and so does 1 - cos^2 of half of it.
-    squared = min(np.cos(0.5 * half) ** 2 * np.exp(-own[3] / rise), 1.0)
+    # A small angle shows by its square alone, as 1 - cos^2 of its half does, and by little: hence the 4.
+    squared = min(np.cos(0.5 * half) ** 2 * np.exp(-4.0 * own[3] / rise), 1.0)
     half = float(np.clip(2 * np.arccos(np.sqrt(squared)), LEAST_HALF, np.pi - LEAST_HALF))
     start, end = ends
     middle = middle + own[:3]
