@@ -37,10 +37,10 @@ def tangents(curve, s):
     return along / np.linalg.norm(along, axis=1, keepdims=True)
 
 
-def blank_views(count=VIEWS, cameras=None):
-    """Views around the unit cube, without edges."""
-    intrinsics, poses = cameras or ring_cameras(count, SIZE)
-    maps = np.zeros((count, SIZE, SIZE), np.uint8)
+def blank_views(count=VIEWS, cameras=None, size=SIZE):
+    """Views around the unit cube, without edges. size: of the pictures, px."""
+    intrinsics, poses = cameras or ring_cameras(count, size)
+    maps = np.zeros((count, size, size), np.uint8)
     return Views(tuple(map(str, range(count))), maps, intrinsics, poses, ("",) * count)
 
 

@@ -10,7 +10,7 @@ from taichi_edges.evidence.edgel_matching import EdgelMatching
 from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
 from taichi_edges.geometry.wireframe import Edge, Wireframe
 from taichi_edges.refinement.adjustment import Constraint, adjusted, with_vertices
-from taichi_edges.refinement.charts import derivatives, moved, nearest_parameters, neighbors, own_unknowns
+from taichi_edges.refinement.charts import LEAST_HALF, derivatives, moved, nearest_parameters, neighbors, own_unknowns
 
 CORNERS = np.array([[0.3, 0.3, 0.3], [0.7, 0.32, 0.3], [0.32, 0.7, 0.35], [0.28, 0.3, 0.75]])
 TILT = np.array([[0.8, 0.6, 0.0], [-0.36, 0.48, 0.8]])  # orthogonal unit vectors
@@ -35,6 +35,12 @@ SHAPES = {
     "spline": WAVE,
 }
 OPEN = [kind for kind, shape in SHAPES.items() if not shape.closed]
+
+
+FLAT = 2 * LEAST_HALF  # radians: an elliptic arc that spans twice as much is as good as a parabola
+PARABOLA = EllipticArc.conjugate(
+    [0.0, 0.0, 0.0], np.array([[0.2 / (1 - np.cos(FLAT))], [0.3 / np.sin(FLAT)]]) * TILT, -FLAT, FLAT
+)
 
 
 def curve_of(shape):
@@ -87,9 +93,8 @@ def test_shape_stays_what_it_is_when_it_moves(kind, generator):
         assert abs(other.axes[0] @ other.axes[1]) < 1e-12
 
 
-@pytest.mark.parametrize("kind", SHAPES)
-def test_unknowns_move_a_shape_about_as_far_as_they_say(kind):
-    shape = SHAPES[kind]
+@pytest.mark.parametrize("shape", [*SHAPES.values(), PARABOLA], ids=[*SHAPES, "parabola"])
+def test_unknowns_move_a_shape_about_as_far_as_they_say(shape):
     pairs = neighbors(shape, ends_of(shape))
     slopes = derivatives(pairs, lambda some: some.at(np.linspace(0, 1, 21)))
     assert slopes.shape == (21, 3, own_unknowns(shape) + (0 if shape.closed else 6))

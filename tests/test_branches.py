@@ -6,12 +6,11 @@ import pytest
 from taichi_edges.strokes import segmentation
 from taichi_edges.strokes.branches import separate_branches
 from taichi_edges.strokes.segmentation import (
-    ARC_PRICE,
-    LINE_PRICE,
     MIN_NOISE,
     MIN_STRETCH,
     NOISE_WINDOW,
     OUTLIER,
+    PRICES,
     STATIONS,
     cut_chain,
     local_noise,
@@ -136,8 +135,8 @@ def slow_cuts(chain):
         ways = []
         for (cost, bounds, kinds), start in zip(best, stations, strict=False):
             line, curve = slow_costs(chain[start:end], noise)
-            ways.append((cost + line + LINE_PRICE * price, [*bounds, end], [*kinds, False]))
-            ways.append((cost + curve + ARC_PRICE * price, [*bounds, end], [*kinds, True]))
+            ways.append((cost + line + PRICES["line"] * price, [*bounds, end], [*kinds, False]))
+            ways.append((cost + curve + PRICES["arc"] * price, [*bounds, end], [*kinds, True]))
         best.append(min(ways, key=lambda way: way[0]))
     return best[-1][1:]
 

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from taichi_edges.errors import UserError
-from taichi_edges.fitting.cubic_chains import BENDING, lsq_chain, nearest_on_chain
+from taichi_edges.fitting.cubic_chains import BENDING, Ordering, fit_chain, lsq_chain, nearest_on_chain
 from taichi_edges.geometry.bezier import LENGTH_SEGMENTS, bernstein, bezier_lengths, evaluate_bezier
 from taichi_edges.geometry.edge_set import EdgeSet, edges_and_about, read_edges, write_edges
 from taichi_edges.points.filtering import filter_points, statistical_inliers
@@ -409,6 +409,19 @@ def test_the_chain_is_the_b_spline_with_double_knots(generator, pieces):
     within = np.linspace(0, 1, 11)[:-1]
     found = evaluate_bezier(lsq_chain(parameters, points, weights, pieces), within)
     np.testing.assert_allclose(found, spline(np.arange(pieces)[:, None] + within), atol=1e-9)
+
+
+@pytest.mark.parametrize("straggler", [[0.3, 0.0, 0.0], [0.1, 0.4, 0.2]])
+def test_a_cubic_is_found_whatever_its_pace(straggler):
+    """Its parameter is not its arc length, so at first it is many tolerances off; in the end the penalty is left."""
+    cubic = np.array([[[0.0, 0.0, 0.0], straggler, [0.3, 0.0, 0.0], [0.3, 0.3, 0.0]]])
+    dense = evaluate_bezier(cubic, np.linspace(0, 1, 4001))[0]
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(dense, axis=0), axis=1))])
+    at = np.linspace(0, arc[-1], 120)
+    points = np.stack([np.interp(at, arc, axis) for axis in dense.T], axis=1)
+    curves, _ = fit_chain(points, Ordering(at, arc[-1], False), NOISE, 1)
+    assert nearest_on_chain(points, curves)[0].max() < 0.5 * NOISE
+    np.testing.assert_allclose(curves[0, [0, 3]], cubic[0, [0, 3]], atol=0.5 * NOISE)
 
 
 def test_distances_to_a_chain_match_brute_force(generator):

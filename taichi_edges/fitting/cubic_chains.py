@@ -8,7 +8,9 @@ from scipy.spatial import cKDTree
 from taichi_edges.arrays.robust import geman_mcclure
 from taichi_edges.geometry.bezier import bernstein, evaluate_bezier
 
-REPARAMETRIZATIONS = 4
+ROUNDS = 3  # of the fit, in which places on the chain and weights settle
+MEDIANS = 4.0  # of the distances, that the tolerance of the robust weights is at least
+SLIDING = 0.01  # weight of residuals along a chain: between its ends, points may lie anywhere along it
 TURN_PER_CUBIC = np.radians(100.0)  # one cubic follows a circular arc of 90 degrees to 3e-4 of the radius
 BENDING = 1e-3  # penalty on second differences of the control points, relative to the data
 CURVE_SAMPLES = 128  # for each cubic, where distances to a curve are measured
@@ -24,14 +26,24 @@ def corrected_error(distances: np.ndarray, parameters: int) -> float:
 
 
 def fit_chain(points: np.ndarray, ordering: "Ordering", tolerance: float, pieces: int) -> tuple[np.ndarray, float]:
-    """`fit_curve` with a given number of pieces."""
-    arc, length, closed = ordering.arc, ordering.length, ordering.closed
-    weights = np.ones(len(points))
-    for _ in range(REPARAMETRIZATIONS):
-        curves = _fit_spline(points, arc / length, weights, pieces, closed)
-        distances, parameters = nearest_on_chain(points, curves)
-        arc = _reparametrize(arc, parameters, length, closed)
-        weights = geman_mcclure((distances / tolerance) ** 2)
+    """`fit_curve` with a given number of pieces.
+
+    Where along it a point belongs is not known, so what counts is its distance across the chain (Wang, Pottmann, Liu
+    2006, tangent distance minimization): moving the parameters alone takes a hundred rounds for what these do.
+    """
+    parameters = ordering.arc / ordering.length * pieces
+    curves = lsq_chain(parameters, points, np.ones(len(points)), pieces, ordering.closed)
+    for _ in range(ROUNDS):
+        distances, nearest = nearest_on_chain(points, curves)
+        width = max(tolerance, MEDIANS * float(np.median(distances)))  # strays are few; of a first fit all may be off
+        weights = geman_mcclure((distances / width) ** 2)
+        parameters = _whole_range(nearest, parameters, pieces, ordering.closed)
+        along = tangents_of_chain(curves, parameters)
+        if not ordering.closed:  # nothing but its outermost points says where a chain ends
+            ends = [parameters.argmin(), parameters.argmax()]
+            along[ends], weights[ends] = 0.0, 1.0
+        curves = lsq_chain(parameters, points, weights, pieces, ordering.closed, along)
+    distances, _ = nearest_on_chain(points, curves)
     return curves, corrected_error(distances, 4 * (pieces + 1))  # two across each end of each piece, value and slope
 
 
@@ -52,42 +64,52 @@ def total_turning(points: np.ndarray, arc: np.ndarray) -> float:
     return float(np.arccos(np.clip((steps[1:] * steps[:-1]).sum(axis=1), -1, 1)).sum() * 11 / 8)
 
 
-def _fit_spline(
-    points: np.ndarray, parameters: np.ndarray, weights: np.ndarray, pieces: int, closed: bool
+def lsq_chain(
+    parameters: np.ndarray,
+    points: np.ndarray,
+    weights: np.ndarray,
+    pieces: int,
+    closed: bool = False,
+    along: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Least-squares chain of cubics over parameters in 0..1, in `pieces` equal spans -> (pieces, 4, 3) Beziers."""
-    if not closed:
-        return lsq_chain(parameters * pieces, points, weights, pieces)
-    # The data repeated on both sides make the middle period periodic.
-    parameters = np.concatenate([parameters, parameters + 1, parameters + 2])
-    chain = lsq_chain(parameters * pieces, np.tile(points, (3, 1)), np.tile(weights, 3), 3 * pieces)
-    controls = chain[pieces : 2 * pieces].copy()
-    joint = 0.5 * (controls[0, 0] + controls[-1, 3])
-    controls[0, 0] = controls[-1, 3] = joint
-    return controls
-
-
-def lsq_chain(parameters: np.ndarray, points: np.ndarray, weights: np.ndarray, pieces: int) -> np.ndarray:
     """Weighted least-squares chain of cubics with a continuous tangent; piece i has the parameters i .. i + 1.
 
     With equal spans a joint is the middle of the two control points next to it, so the unknowns are the polygon of the
-    inner control points and the chain's two ends: the coefficients of a cubic B-spline with double knots. A faint
-    penalty on the bending of that polygon carries the chain over pieces without points. Returns (pieces, 4, 3).
+    inner control points, and the ends of an open chain: the coefficients of a cubic B-spline with double knots. A faint
+    penalty on the bending of that polygon carries the chain over pieces without points. along: (n, 3) unit vectors in
+    which residuals hardly count, for the parameters are no more than a guess; 0 where they count. Returns
+    (pieces, 4, 3).
     """
+    size = 2 * pieces if closed else 2 * pieces + 2
     local = np.tile([[0.5, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0.5, 0.5]], (pieces, 1, 1))
-    local[0, 0], local[-1, 3] = (1, 0, 0, 0), (0, 0, 0, 1)  # (pieces, 4, 4) control points from unknowns 2 i .. 2 i + 3
-    unknowns = 2 * np.arange(pieces)[:, None] + np.arange(4)
+    if not closed:
+        local[0, 0], local[-1, 3] = (1, 0, 0, 0), (0, 0, 0, 1)
+    unknowns = (2 * np.arange(pieces)[:, None] + np.arange(4)) % size
+    controls = np.zeros((pieces, 4, size))  # control points from unknowns
+    np.add.at(controls, (np.arange(pieces)[:, None, None], np.arange(4)[:, None], unknowns[:, None]), local)
     piece = np.clip(parameters.astype(int), 0, pieces - 1)
-    design = np.zeros((len(points), 2 * pieces + 2))
-    shares = np.einsum("nb,nbu->nu", bernstein(np.clip(parameters - piece, 0.0, 1.0)), local[piece])
-    np.put_along_axis(design, unknowns[piece], shares, axis=1)
-    rows = np.sqrt(weights)[:, None]
-    bend = np.diff(np.eye(design.shape[1]), 2, axis=0) * BENDING * np.sqrt(weights.sum())
-    targets = np.concatenate([points * rows, np.zeros((len(bend), 3))])
+    design = np.einsum("nb,nbu->nu", bernstein(np.clip(parameters - piece, 0.0, 1.0)), controls[piece])
+    around = np.eye(size)[np.arange(size + 2) % size] if closed else np.eye(size)
+    bend = np.diff(around, 2, axis=0) * BENDING * np.sqrt(weights.sum())
     # Normal equations: a B-spline's are well conditioned, and small whatever the number of points.
-    system = np.concatenate([design * rows, bend])
-    polygon = np.linalg.solve(system.T @ system, system.T @ targets)
-    return local @ polygon[unknowns]
+    weighted = weights[:, None] * design
+    normal, right = weighted.T @ design + bend.T @ bend, weighted.T @ points
+    if along is None:
+        return controls @ np.linalg.solve(normal, right)
+    lengthwise = (design[:, :, None] * along[:, None, :]).reshape(len(points), 3 * size)
+    weighted = (1.0 - SLIDING) * weights[:, None] * lengthwise
+    normal = np.kron(normal, np.eye(3)) - weighted.T @ lengthwise
+    right = right.ravel() - weighted.T @ (points * along).sum(axis=1)
+    polygon = np.linalg.solve(normal, right).reshape(size, 3)
+    return controls @ polygon
+
+
+def tangents_of_chain(curves: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    """(n, 3) unit tangents of a chain of cubics at (n,) parameters (piece + t)."""
+    piece = np.clip(parameters.astype(int), 0, len(curves) - 1)
+    t, legs = (parameters - piece)[:, None], np.diff(curves[piece], axis=1)
+    along = (1 - t) ** 2 * legs[:, 0] + 2 * t * (1 - t) * legs[:, 1] + t**2 * legs[:, 2]
+    return along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
 
 
 def nearest_on_chain(points: np.ndarray, curves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -108,15 +130,14 @@ def nearest_on_chain(points: np.ndarray, curves: np.ndarray) -> tuple[np.ndarray
     return np.minimum(before, after), np.where(before < after, *reached)
 
 
-def _reparametrize(arc: np.ndarray, parameters: np.ndarray, length: float, closed: bool) -> np.ndarray:
-    """Arc lengths moved to the nearest points of the chain; the ends of an open chain keep the whole range in use."""
-    pieces = max(np.ceil(parameters.max()), 1.0)
-    moved = parameters / pieces * length
+def _whole_range(nearest: np.ndarray, before: np.ndarray, pieces: int, closed: bool) -> np.ndarray:
+    """(n,) parameters of the nearest places on a chain; the ends of an open chain keep the whole range in use.
+
+    before: (n,) those of the round before.
+    """
     if closed:  # a nearest sample on the other side of the joint is the same place, one period on
-        moved += np.round((arc - moved) / length) * length
-        return np.clip(moved, 0.0, length)
-    spread = moved.max() - moved.min()
-    return (moved - moved.min()) / max(spread, 1e-300) * length
+        return np.clip(nearest + np.round((before - nearest) / pieces) * pieces, 0.0, pieces)
+    return (nearest - nearest.min()) / max(np.ptp(nearest), 1e-300) * pieces
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ import numpy as np
 from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline
 
 STEP = 1e-6  # unit-cube units, of the differences that derivatives are; the square of 1e-5 of a pixel
-LEAST_HALF = 1e-6  # radians: half of what an arc spans stays between this and a half turn
+LEAST_HALF = 0.05  # radians: half of what an arc spans stays between this, a parabola to 1e-4, and a half turn
 FLATTEST = 1e-7  # sagitta of an arc over half its chord
 CHORDS, NEWTON = 32, 8  # of each cubic, where the nearest place is looked for first; and rounds until it is found
 
@@ -116,9 +116,11 @@ def _rotation(vector: np.ndarray) -> np.ndarray:
 
 def _moved_elliptic_arc(arc: EllipticArc, ends: np.ndarray, own: np.ndarray) -> EllipticArc:
     """With half the angle it spans h: centre + u cos t + v sin t, t from -h to h, through ends and middle."""
-    half, middle = 0.5 * (arc.high - arc.low), arc.at(np.array([0.5]))[0]
-    half = 2 * np.arctan(np.tan(0.5 * half) * np.exp(own[3] / arc.radii.mean()))  # stays between 0 and a half turn
-    half = float(np.clip(half, LEAST_HALF, np.pi - LEAST_HALF))
+    half, (first, middle, last) = 0.5 * (arc.high - arc.low), arc.at(np.array([0.0, 0.5, 1.0]))
+    rise = np.linalg.norm(middle - 0.5 * (first + last))
+    # A small angle shows by its square alone, as 1 - cos^2 of its half does, and by little: hence the 4.
+    squared = min(np.cos(0.5 * half) ** 2 * np.exp(-4.0 * own[3] / rise), 1.0)
+    half = float(np.clip(2 * np.arccos(np.sqrt(squared)), LEAST_HALF, np.pi - LEAST_HALF))
     start, end = ends
     middle = middle + own[:3]
     across = (end - start) / (2 * np.sin(half))

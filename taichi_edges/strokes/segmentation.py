@@ -8,7 +8,7 @@ straight and curved stretches; the cluster is cut at both ends of every straight
 import numpy as np
 
 from taichi_edges.arrays.ranges import ragged, starts_of
-from taichi_edges.fitting.prices import ARC_PRICE, LINE_PRICE, OUTLIER
+from taichi_edges.fitting.prices import OUTLIER, PRICES
 from taichi_edges.strokes.neighbors import UNASSIGNED, members_of_clusters
 from taichi_edges.strokes.ordering import order_points
 
@@ -66,7 +66,7 @@ def cut_chain(chain: np.ndarray) -> tuple[list[int], list[bool]]:
     stations = np.unique(np.linspace(0, count, min(STATIONS, count // MIN_STRETCH) + 1).round().astype(int))
     ends, starts = np.tril_indices(len(stations), -1)  # a stretch runs from any station to any later one
     costs = np.stack(stretch_costs(chain, stations[starts], stations[ends], noise), axis=1)
-    costs += np.array([LINE_PRICE, ARC_PRICE]) * np.log(count)  # a cubic stands for an arc
+    costs += np.array([PRICES["line"], PRICES["arc"]]) * np.log(count)  # a cubic stands for an arc
     best = np.zeros(len(stations))
     came_from, was_curved = np.zeros(len(stations), int), np.zeros(len(stations), bool)
     for end in range(1, len(stations)):
