@@ -44,13 +44,15 @@ def test_edgels_keep_their_views():
     assert len(Edgels.of_views([])) == 0
 
 
-def test_edgels_know_their_blur_where_the_detector_tells_it():
+def test_edgels_know_blur_and_outline_where_the_detector_tells_them():
     none, known = [(np.ones((2, 2)), np.ones((2, 2)), np.ones(2))], (np.ones((1, 2)), np.ones((1, 2)), np.ones(1))
-    edgels = Edgels.of_views([*none, (*known, np.array([0.5]))])
+    edgels = Edgels.of_views([*none, (*known, np.array([0.5]), np.array([True]))])
+    assert edgels.outlines.tolist() == [False, False, True]
     np.testing.assert_array_equal(edgels.blurs, np.array([np.nan, np.nan, 0.5], np.float32))
-    assert edgels.keep(np.array([False, True, True])).blurs[1] == 0.5
+    kept = edgels.keep(np.array([False, True, True]))
+    assert kept.blurs[1] == 0.5 and kept.outlines.tolist() == [False, True]
     some = edgels.of_some([1, 0, 1])
-    assert some.starts.tolist() == [0, 1, 3, 4]
+    assert some.starts.tolist() == [0, 1, 3, 4] and some.outlines.tolist() == [True, False, False, True]
     np.testing.assert_array_equal(some.blurs, np.array([0.5, np.nan, np.nan, 0.5], np.float32))
 
 
