@@ -68,7 +68,7 @@ def views_of_part(size):
     for view in range(VIEWS):
         points, normals = zip(*(project_edgels(blank, view, of, apart=1.0) for of in curves_of_part()), strict=True)
         points, normals = np.concatenate(points), np.concatenate(normals)
-        of_views.append((points, normals, np.ones(len(points)), np.zeros(len(points))))
+        of_views.append((points, normals, *(np.full(len(points), value) for value in (1.0, 0.0, False))))
     edgels = Edgels.of_views(of_views)
     return replace(blank, edgels=edgels, edge_maps=draw_edge_maps(edgels, size, size, 2))
 
