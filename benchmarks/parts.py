@@ -274,6 +274,8 @@ def print_fitted(done: list[Job], out: Path, data: Path | None, pool: ProcessPoo
         return fitted_weights(marks, right, np.concatenate(weights))
 
     print(f"\nWeights of the verdict, the constant last: {np.round(fitted(first), 2).tolist()}")
+    sure = np.concatenate([found[job][0][(found[job][1] >= FOUND) & ~found[job][3]] for job in first])
+    print(f"Medians of the marks of edges that are right: {np.round(np.median(sure, axis=0), 2).tolist()}")
     rows = []
     for job in first:
         others = [other for other in first if other.name.split("_")[:2] != job.name.split("_")[:2]]
