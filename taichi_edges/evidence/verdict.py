@@ -40,7 +40,7 @@ MOST_OUTSIDE_PX = 0.5  # more says no more
 MARKS = ("steadiness", "blur", "spread", "sharpness", "outside")
 
 HARDLY_STEADY = 0.1  # an edge that no more of the edgels about it lie on is shown by none
-TYPICAL = (0.74, 0.0, 0.5, 0.78, 0.0)  # medians of the MARKS of edges that are right, of the scenes of `--fit-verdict`
+TYPICAL = (0.7, 0.0, 0.5, 0.8, 0.0)  # medians of the MARKS of edges that are right, as `--fit-verdict` prints them
 
 
 @dataclass(frozen=True)
