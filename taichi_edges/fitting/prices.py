@@ -10,6 +10,7 @@ if TYPE_CHECKING:
 OUTLIER = 9.0  # squared noises that one observation can cost: three standard deviations
 # Free parameters, as `refinement/charts.py` has them: a line has its two ends, an arc its middle across the chord too.
 PRICES = {"line": 6, "arc": 8, "circle": 6, "elliptic_arc": 10, "ellipse": 8, "spline": 12}
+SHARED_PLACE = 3  # of these, of each shape that begins where another ends
 NEXT_CUBIC_PRICE = 6  # of one more cubic in a spline, which is smooth
 MOST_CUBICS = 4  # of an open chain
 

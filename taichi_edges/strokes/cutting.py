@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from taichi_edges.fitting.model_selection import Track, Yardstick, best_shape
-from taichi_edges.fitting.prices import PRICES
+from taichi_edges.fitting.prices import PRICES, SHARED_PLACE
 from taichi_edges.geometry.shapes import Shape
 from taichi_edges.strokes.segmentation import stretch_costs
 
@@ -31,7 +31,8 @@ def cut_stroke(points: np.ndarray, yardstick: Yardstick) -> list[slice]:
     ends, starts = np.tril_indices(len(stations), -1)  # a stretch runs from any station to any later one
     share = step_length(points) / yardstick.stretch  # of an observation that a point is
     costs = share * np.stack(stretch_costs(points, stations[starts], stations[ends], yardstick.noise), axis=1)
-    costs += np.array([PRICES["line"], PRICES["arc"]]) * np.log(max(share * count, np.e))
+    prices = np.array([PRICES["line"], PRICES["arc"]]) - SHARED_PLACE  # the first one's, too: it makes no difference
+    costs += prices * np.log(max(share * count, np.e))
     best, came_from = np.zeros(len(stations)), np.zeros(len(stations), int)
     for end in range(1, len(stations)):
         totals = best[:end] + costs[ends == end].min(axis=1)
