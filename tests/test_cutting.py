@@ -102,7 +102,7 @@ def test_hardly_any_points_are_one_stretch_and_no_edge_if_too_short(count):
 
 def test_strokes_become_the_edges_of_their_stretches(generator):
     points, _ = slot(generator)
-    circle = noisy(generator, bend([0, 0, 0], 30, 0, 3))
+    circle = noisy(generator, bend([0, 0, 0], 30, 0, 2))
     every, strokes = np.concatenate([points, circle]), np.repeat([0, 4], [len(points), len(circle)])
     clusters = assemble_strokes(every, np.tile([1.0, 0, 0], (len(every), 1)), strokes, YARDSTICK)
     assert clusters.noise == YARDSTICK.noise and len(clusters.arcs) == 4 and (np.diff(clusters.labels) >= 0).all()

@@ -2,7 +2,8 @@
 
 Points along a stroke are in order, so dynamic programming over all ways to cut it finds the cheapest: squared distances
 to the line or cubic of each stretch in units of the noise, and for every parameter the logarithm of the number of
-observations (BIC, `fitting/model_selection.py`).
+observations (BIC, `fitting/model_selection.py`). A cubic is no arc of more than some 150 degrees: longer ones are cut,
+and are one again where strokes that continue each other are cut anew.
 """
 
 from itertools import pairwise
