@@ -4,7 +4,7 @@ Three kinds of things pass for edges. A contour of a rounded surface moves over 
 one line from some directions, and beside it from others. A rounded edge stays where it is, but the pictures show it
 blurred, as a sharp one never is. And lines that chance has put between edges have few edgels, and those lie badly. Each
 says something and none says all, so the verdict is a logistic regression over the marks they leave (`MARKS`), all of
-them counts, shares, and multiples of the noise: none depends on the scene's size or units.
+them shares, sines and pixels: none depends on the scene's size or units.
 
 The weights were fitted to edges whose truth is known, `benchmarks/parts.py --fit-verdict`: real CAD parts, ABC scenes
 and synthetic ones, from pictures and from drawn maps.
