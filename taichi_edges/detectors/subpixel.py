@@ -9,8 +9,8 @@ For each scale, the fine ones first:
 3. Maxima of the gradient across the edge, at sub-pixel positions. Their ratio says how far they stand out: of what
    is beside them (a smooth shading, however steep, does not) in units of the clutter.
 4. Maxima are linked into chains, and every maximum of a chain is a vote for or against an edge here: the logarithm of
-   its ratio, less what the chain winds. Votes add up along a chain, so that a long smooth chain may be faint, while
-   noise, whose votes are negative, never gathers enough.
+   its ratio, less what the chain winds. Votes add up along a chain, clear ones by their squares, so that a long smooth
+   chain may be faint, a clear one may be short, and noise, whose votes are negative, never gathers enough.
 
 A coarse scale adds what the finer ones did not find: edges that drown in noise, and blurred ones.
 """
@@ -42,16 +42,17 @@ MARGIN = 2  # px at the image's border where no edgel is looked for: as far as a
 # Grey levels of 255: a lower step does not count. Steps of one level are what rounding makes of smooth shading.
 MIN_STEP = 1.4
 CLUTTER_SIGMA = 2.0  # px; directions are compared over so much, which is short against the curves of most edges
-CLUTTER_WINDOW = 12.0  # px; the clutter's mean is taken over so much, wide against the neighbourhood of one edge
+CLUTTER_WINDOW = 40.0  # px; the clutter's mean is taken over so much, wide against a group of slots or letters
 BESIDE = 3.0  # blurs of the edge; there its own gradient is nearly gone (1 %)
 
 LOW = 1.6  # times the clutter; less is no candidate
 NEEDED = 2.5  # ratio of a maximum that speaks neither for nor against an edge; noise has maxima of 1.5 to 2.5
 MOST = 3.0  # votes of one maximum at most, for or against: reached at 20 times the ratio needed
-ENOUGH = 15.0  # votes for an edge: 5 maxima that are as clear as can be, or 37 of a ratio of 1.5 times what is needed
+ENOUGH = 15.0  # votes for an edge: 5 maxima of 6 times the ratio needed, or 37 of 1.5 times that
 WINDOW = 5  # maxima to each side that are asked whether the edge goes on here
 STRAIGHT = 0.9  # mean of the unit normals over the window; a circle with a radius of 7 px has it
 WINDING = 5.0  # votes lost when the mean of the normals falls by 1
+MOST_LOST = 1.5  # votes that winding costs at most: a contour three pixels wide winds, and stands out as no noise does
 MAX_TURN = np.cos(np.radians(50.0))  # from one maximum to the next of a chain
 MIN_CHORD = 3.0  # px; of nearer ends the directions say little about the curvature
 MAX_CURVATURE = 0.25  # 1 / px; a corner is no circle of a smaller radius
@@ -334,11 +335,12 @@ def _chained(maxima: Maxima, shape: tuple[int, ...], blur: float) -> tuple[Maxim
 
     straight = np.hypot(mean(maxima.normals[:, 0]), mean(maxima.normals[:, 1]))
     votes = np.log(np.maximum(maxima.ratios / NEEDED, np.exp(-MOST))).clip(max=MOST)
-    votes -= WINDING * np.maximum(STRAIGHT - straight, 0.0)
+    votes -= np.minimum(WINDING * np.maximum(STRAIGHT - straight, 0.0), MOST_LOST)
     goes_on = mean(votes) > 0
     chain_starts = np.concatenate([[False], low[1:] > high[:-1] - 1])
     runs = np.cumsum(chain_starts | np.concatenate([[False], goes_on[1:] != goes_on[:-1]]))
-    kept = goes_on & (np.bincount(runs, votes)[runs] >= ENOUGH)
+    sums = np.bincount(runs, votes * np.maximum(votes, 1.0))  # few clear ones say more than many that noise may be
+    kept = goes_on & (sums[runs] >= ENOUGH)
     shifts = 0.5 * blur**2 * _curvatures(maxima, low, high - 1)
     points = maxima.points + shifts[:, None] * maxima.normals
     means = mean(maxima.ratios), mean(maxima.widths), mean(maxima.steepness)
