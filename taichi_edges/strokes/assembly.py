@@ -21,6 +21,7 @@ from taichi_edges.strokes.merging import merged
 from taichi_edges.strokes.neighbors import UNASSIGNED, NeighborGraph, alignment, members_of_clusters, neighbor_graph
 from taichi_edges.strokes.noise import MOST_NOISE, measured_scale
 from taichi_edges.strokes.segmentation import split_clusters
+from taichi_edges.strokes.small_circles import small_circles
 
 if TYPE_CHECKING:
     from taichi_edges.scene.settings import ClusterConfig, FitConfig
@@ -84,16 +85,20 @@ def left_over(cloud: Cloud, graph: NeighborGraph, owner: np.ndarray, config: "Cl
 
 
 def assemble_strokes(points: np.ndarray, directions: np.ndarray, strokes: np.ndarray, yardstick: Yardstick) -> Clusters:
-    """The Clusters of oriented points that are in order along strokes: of each stroke its stretches.
+    """The Clusters of oriented points that are in order along strokes: small circles, and of each stroke its stretches.
 
     points, directions: (n, 3) unit cube, unit vectors. strokes: (n,) int, rising. yardstick: Yardstick.
     """
-    labels, count = np.full(len(points), UNASSIGNED), 0
-    for members in np.split(np.arange(len(points)), np.flatnonzero(np.diff(strokes)) + 1):
+    labels, circles = np.full(len(points), UNASSIGNED), small_circles(points, directions, strokes, yardstick)
+    for number, (_, members) in enumerate(circles):
+        labels[members] = number
+    left, count = np.flatnonzero(labels == UNASSIGNED), len(circles)
+    for members in np.split(left, np.flatnonzero(np.diff(strokes[left])) + 1):
         for stretch in cut_stroke(points[members], yardstick) if len(members) else ():
             labels[members[stretch]] = count
             count += 1
-    return Clusters.of(points, directions, labels, yardstick.noise)
+    arcs = (*(circle for circle, _ in circles), *[None] * (count - len(circles)))
+    return Clusters(points, directions, labels, np.zeros((0, 2), np.int64), arcs, yardstick.noise)
 
 
 def fit_strokes(clusters: Clusters, pixel: float) -> tuple[Wireframe, dict[str, int]]:
@@ -102,8 +107,8 @@ def fit_strokes(clusters: Clusters, pixel: float) -> tuple[Wireframe, dict[str, 
     pixel: size of a pixel at the scene, unit-cube units.
     """
     yardstick, fits = Yardstick(clusters.noise, pixel), []
-    for members in members_of_clusters(clusters.labels):
-        shape = shape_of_stretch(clusters.points[np.sort(members)], yardstick)
+    for members, circle in zip(members_of_clusters(clusters.labels), clusters.arcs, strict=True):
+        shape = circle.shape() if circle else shape_of_stretch(clusters.points[np.sort(members)], yardstick)
         kind = "short" if shape is None else "loop" if shape.closed else "line" if shape.kind == "line" else "curve"
         fits.append(ClusterFit(kind, shape))
     return wireframe_of(fits)
