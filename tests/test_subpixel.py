@@ -207,12 +207,33 @@ def test_both_sides_of_a_thin_line_are_found_where_they_are(width, ratio, genera
         assert np.isnan(np.concatenate(blurs)).mean() > 0.6  # how wide a maximum is does not tell anything here
 
 
+@pytest.mark.parametrize("radius", [1.6, 2.5, 4.0])
+def test_holes_of_a_few_pixels_are_found_sharp_and_where_they_are(generator, radius):
+    for _ in range(6):
+        centre = generator.uniform(44, 52, 2)
+        points, _, _, blurs, _ = detect_edgels(mixed(disk(centre, radius), 0.6, 0.1))
+        away = np.linalg.norm(points - centre, axis=1)
+        assert np.abs(away - radius).max() < 0.75 and abs(np.median(away) - radius) < 0.2
+        turns = np.sort(np.arctan2(*(points - centre).T))
+        assert np.diff(np.append(turns, turns[0] + 2 * np.pi)).max() < np.radians(130)  # all the way round
+        assert not (blurs > 0.3).any()  # unknown, or sharp
+
+
+def test_slots_beside_each_other_are_no_clutter():
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+    slot = (rows % 8 < 3) & (columns % 14 < 10) & (np.minimum(rows, columns) > 8) & (np.maximum(rows, columns) < 86)
+    points = detect_edgels(np.where(slot, 90, 200).astype(np.uint8))[0]
+    sides = [(row, column) for row in range(16, 80, 8) for column in range(14, 80, 14)]
+    found = [np.hypot(points[:, 0] - (column + 4.5), points[:, 1] - (row - 0.5)).min() < 1.0 for row, column in sides]
+    assert np.mean(found) > 0.9
+
+
 def test_blank_pictures_shading_and_its_rounding_give_nothing():
     assert len(detect_edgels(np.full((SIZE, SIZE, 3), 90, np.uint8))[0]) == 0
     assert len(detect_edgels(np.zeros((SIZE, SIZE, 4), np.uint8))[0]) == 0  # nothing but background
     assert len(detect_edgels(np.zeros((3, 3, 3), np.uint8))[0]) == 0
     rows, columns = np.mgrid[:SIZE, :SIZE]
-    for ramp in (0.07 * columns + 0.02 * rows, 2.0 * columns + 0.5 * rows):  # steps of a level far apart; steep
+    for ramp in (0.07 * columns + 0.02 * rows, 1.9 * columns + 0.5 * rows):  # steps of a level far apart; steep
         assert len(detect_edgels(np.rint(20 + ramp).astype(np.uint8))[0]) == 0
     ball = 1 - ((columns - 48) ** 2 + (rows - 48) ** 2) / SIZE**2
     assert len(detect_edgels(encoded(0.8 * ball))[0]) == 0

@@ -40,18 +40,19 @@ def beside_each_other(points: np.ndarray, normals: np.ndarray, blur: float) -> t
 
 
 def disentangled(
-    points: np.ndarray, normals: np.ndarray, steepness: np.ndarray, blur: float
+    points: np.ndarray, normals: np.ndarray, steepness: np.ndarray, straight: np.ndarray, blur: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n,) px by which each edge is off its maximum, along its normal; and (n,) bool, whether nothing beside it has
     changed the width of the maximum.
 
-    points, normals: (n, 2) of the maxima. steepness: (n,) gradients there. blur: px, of a sharp edge. Solved by
-    iteration: from the places and heights of all the gradients at all maxima, and from these the places and heights.
+    points, normals: (n, 2) of the maxima. steepness: (n,) gradients there. straight: (n,) bool; the others are on small
+    circles and stay where they are. blur: px, of a sharp edge. Solved by iteration: from the places and heights of all
+    the gradients at all maxima, and from these the places and heights.
     """
     count, variance = len(points), blur * blur
     shifts, heights = np.zeros(count), steepness.astype(np.float64)
     first, second, across, signs = beside_each_other(points, normals, blur)
-    room = np.full(count, np.inf)
+    room = np.where(straight, np.inf, 0.0)
     np.minimum.at(room, first, np.maximum(np.abs(across) - LEAST_GAP_PX, 0.0) / 2)
     most = np.minimum(room, MOST_SHIFT * blur)
 

@@ -55,7 +55,10 @@ WINDING = 5.0  # votes lost when the mean of the normals falls by 1
 MOST_LOST = 1.5  # votes that winding costs at most: a contour three pixels wide winds, and stands out as no noise does
 MAX_TURN = np.cos(np.radians(50.0))  # from one maximum to the next of a chain
 MIN_CHORD = 3.0  # px; of nearer ends the directions say little about the curvature
-MAX_CURVATURE = 0.25  # 1 / px; a corner is no circle of a smaller radius
+NARROW = 2  # maxima to each side that tell it then: a window that goes all the way round a small hole tells nothing
+SMALLEST, MOST_BENT = 0.81, 0.9  # curvatures times the blur: of a disc whose rim stays where it is; of any blurred rim
+TOO_BENT = 0.5  # the same: of a disc whose rim is not blurred in a way of its own any more
+ROUND = 0.3  # 1 / px; what is opposite on so small a circle is no line beside it
 WIDEST = 4.0  # px; what is blurred by more has no width that neighbouring pixels could tell
 MIN_RUN = 5  # maxima; what remains of a coarse chain beside finer ones must be longer
 HALF_SURE = 12.0  # ratio of an edge that gets the strength 0.5
@@ -91,6 +94,7 @@ class Maxima(Columns):
     rows, columns: (n,) their pixels. points: (n, 2) pixels (u, v). normals: (n, 2) unit, towards more light.
     ratios: (n,) how far they stand out of what is beside them, in units of the clutter. widths: (n,) px^2, variance of
     the gradient's profile across the edge, a Gaussian where the edge is a blurred step. steepness: (n,) the gradient.
+    curvatures: (n,) of the chain, 1 / px, see `_curvatures`.
     """
 
     rows: np.ndarray
@@ -100,6 +104,7 @@ class Maxima(Columns):
     ratios: np.ndarray
     widths: np.ndarray
     steepness: np.ndarray
+    curvatures: np.ndarray
 
 
 def trace_pictures(
@@ -151,7 +156,8 @@ def detect_edgels(image: Picture | np.ndarray) -> tuple[np.ndarray, ...]:
     layers: list[Maxima] = []
     for field in _fields(picture):
         edges, runs = _chained(_maxima(field, _clutter(field)), shape, field.blur)
-        shifts, alone = disentangled(edges.points, edges.normals, edges.steepness, field.blur)
+        straight = np.abs(edges.curvatures) < ROUND
+        shifts, alone = disentangled(edges.points, edges.normals, edges.steepness, straight, field.blur)
         widths = np.where(alone, edges.widths - field.blur**2, np.nan)
         edges = replace(edges, points=edges.points + shifts[:, None] * edges.normals, widths=widths)
         free = ~_beside_taken(taken, edges, 1.5 * field.sigma)
@@ -258,7 +264,7 @@ def _maxima(field: Field, clutter: np.ndarray) -> Maxima:
     points = np.stack([columns, rows], axis=1).astype(np.float32) + offsets[:, None] * normals
     standing_out = size - _beside(field, rows, columns, normals)
     ratios = standing_out * (field.levels / clutter)[rows, columns]
-    return Maxima(rows, columns, points, normals, ratios, widths, size).keep(ratios > LOW)
+    return Maxima(rows, columns, points, normals, ratios, widths, size, np.zeros(len(rows))).keep(ratios > LOW)
 
 
 def _candidates(field: Field, squares: np.ndarray, clutter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -322,8 +328,9 @@ def _beside(field: Field, rows: np.ndarray, columns: np.ndarray, normals: np.nda
 def _chained(maxima: Maxima, shape: tuple[int, ...], blur: float) -> tuple[Maxima, np.ndarray]:
     """The Maxima that are edges, along their chains, ratios averaged there; and (n,) int, the run each belongs to.
 
-    Where the edge is curved, blurring by `blur` pixels moved it inwards by half of blur^2 / radius; it is moved back. And
-    the gradient's profile became wider, by blur^4 / radius^2 (measured on discs with radii of 2 px and more).
+    Where the edge is curved, blurring by `blur` pixels moved it inwards by half of blur^2 / radius; it is moved back.
+    On discs of less than two blurs it moved less: no maximum is nearer to a centre than the blur. And the gradient's
+    profile became wider, by blur^4 / radius^2 (measured on discs with radii of 2 px and more).
     """
     if len(maxima) == 0:
         return maxima, np.zeros(0, np.int64)
@@ -343,25 +350,30 @@ def _chained(maxima: Maxima, shape: tuple[int, ...], blur: float) -> tuple[Maxim
     sums = np.bincount(runs, votes * np.maximum(votes, 1.0))  # few clear ones say more than many that noise may be
     kept = goes_on & (sums[runs] >= ENOUGH)
     curvatures = _curvatures(maxima, low, high - 1)
-    shifts = 0.5 * blur**2 * np.nan_to_num(curvatures).clip(-MAX_CURVATURE, MAX_CURVATURE)
+    bent = (blur * curvatures).clip(-MOST_BENT, MOST_BENT)
+    shifts = 0.5 * blur * bent * (1 - np.abs(bent / SMALLEST) ** 3)  # of a disc, within 0.01 of the blur
     points = maxima.points + shifts[:, None] * maxima.normals
-    widths = mean(maxima.widths) - (blur**2 * curvatures) ** 2
-    means = mean(maxima.ratios), widths, mean(maxima.steepness)
+    widths = np.where(np.abs(bent) < TOO_BENT, mean(maxima.widths) - (blur**2 * curvatures) ** 2, np.nan)
+    means = mean(maxima.ratios), widths, mean(maxima.steepness), curvatures
     smoothed = Maxima(maxima.rows, maxima.columns, points, maxima.normals, *means)
     return smoothed.keep(kept), runs[kept]
 
 
 def _curvatures(maxima: Maxima, first: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """(n,) 1 / pixels, positive where the normals point away from the centre: from the two ends of each window. NaN
-    where these are too near to each other.
+    """(n,) 1 / pixels, positive where the normals point away from the centre: from the two ends of each window, or of
+    a narrower one where these are too near to each other.
 
     On a circle the normals differ by the chord over the radius, however long it is.
     """
+    here = np.arange(len(maxima))
+    near = ((maxima.points[last] - maxima.points[first]) ** 2).sum(axis=1) <= MIN_CHORD**2
+    first, last = (
+        np.where(near, np.maximum(first, here - NARROW), first),
+        np.where(near, np.minimum(last, here + NARROW), last),
+    )
     chords = maxima.points[last] - maxima.points[first]
     turns = maxima.normals[last] - maxima.normals[first]
-    squares = (chords**2).sum(axis=1)
-    curvatures = (chords * turns).sum(axis=1) / np.maximum(squares, 1.0)
-    return np.where(squares > MIN_CHORD**2, curvatures, np.nan)
+    return (chords * turns).sum(axis=1) / np.maximum((chords**2).sum(axis=1), 1.0)
 
 
 def _links(maxima: Maxima, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:

@@ -1,9 +1,9 @@
 """Small whole circles: the rims of bolt holes and pins, a few pixels wide.
 
-A rim of three pixels is found in pieces of two or three points, and to BIC each of these is a line: so short a stretch is
-hardly one observation. But the points of all its pieces lie on one circle, and their directions run along it, all the
-way round. A circle is proposed by the points of one stroke, whose directions tell where its centre is, and takes what
-lies on it, of whatever stroke.
+A rim of three pixels is found in pieces of two or three points, and to BIC each of these is a line: so short a stretch
+is hardly one observation. But the points of all its pieces lie on one circle, and their directions run along it, all
+the way round. A circle is proposed by the points of one stroke, whose directions tell where its centre is, and takes
+what lies on it, of whatever stroke.
 """
 
 from collections.abc import Iterator
