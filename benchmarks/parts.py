@@ -217,6 +217,7 @@ def marks_of_job(job: Job, out: Path, data: Path | None) -> tuple[np.ndarray, ..
     from taichi_edges.evidence.edge_support import EdgeSamples, support_of
     from taichi_edges.evidence.edgel_matching import EdgelMatching
     from taichi_edges.evidence.verdict import marks_of
+    from taichi_edges.geometry.shapes import middles_of
     from taichi_edges.geometry.wireframe import read_wireframe
     from taichi_edges.kernels.device import kernel_cache, start_taichi
     from taichi_edges.refinement.stage import edgel_noise, refine_wireframe
@@ -238,7 +239,8 @@ def marks_of_job(job: Job, out: Path, data: Path | None) -> tuple[np.ndarray, ..
         marks = marks_of(matching, shapes, edgel_noise(support_of(matching, shapes)))
         samples = EdgeSamples.along(shapes, SPACING)
         right = samples.sums(near(samples.points, points).astype(float)) / np.maximum(np.diff(samples.starts), 1)
-        found.append((marks, right, np.array([shape.length for shape in shapes]) / matching.pixel))
+        lengths = np.array([shape.length for shape in shapes]) / matching.pixel_at(middles_of(shapes))
+        found.append((marks, right, lengths))
     marks, right, lengths = (np.concatenate(columns) for columns in zip(*found, strict=True))
     return marks, right, lengths, np.arange(len(lengths)) >= len(unjudged)
 

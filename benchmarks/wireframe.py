@@ -111,7 +111,7 @@ def merged(loose, views, config):
     """Strokes that continue each other are one edge."""
     matching = EdgelMatching(views)
     yardstick, seen = yardstick_of(loose.shapes, matching), partial(support_along, matching)
-    return Wireframe.loose(continued(loose.shapes, yardstick, seen)[0])
+    return Wireframe.loose(continued(loose.shapes, yardstick, matching.pixel_at, seen)[0])
 
 
 def extended(loose, views, config):
@@ -123,7 +123,7 @@ def joined(loose, views, config):
     """Edges end in shared vertices, and short lines that are missing between these are found."""
     matching = EdgelMatching(views)
     shapes = whole_edges(loose.shapes, matching, config)[0]
-    return completed(connected(shapes, matching.pixel), matching)[0]
+    return completed(connected(shapes, matching.pixel_at), matching)[0]
 
 
 def refined(loose, views, config):

@@ -152,6 +152,11 @@ def pixel_of(views):
     return pixel_size(views)
 
 
+def pixel_everywhere(pixel):
+    """Function of (n, 3) places: size of a pixel, the same at all."""
+    return lambda places: np.full(len(places), pixel)
+
+
 def displaced(curve, count, distance, generator):
     """(count, 3) points of a curve, moved sideways by up to `distance`, and its tangents there."""
     s = generator.uniform(0.05, 0.95, count)

@@ -121,16 +121,16 @@ def test_free_ends_are_not_completed(taichi, generator, errors):
 
 def test_pairs_are_near_and_open_and_of_vertices_where_edges_meet(generator):
     """Against all pairs, one by one."""
-    vertices, pixel = generator.random((40, 3)), 0.004
+    vertices, pixels = generator.random((40, 3)), generator.uniform(0.002, 0.006, 40)
     joined = {tuple(sorted(pair)) for pair in generator.integers(0, 40, (50, 2)).tolist() if pair[0] != pair[1]}
     edges = tuple(Edge(Line(vertices[list(pair)]), pair) for pair in sorted(joined))
     wireframe = Wireframe(vertices, edges, np.array([[0, 1], [5, 2]]))
-    found, degrees = open_pairs(wireframe, pixel), wireframe.degrees
+    found, degrees = open_pairs(wireframe, pixels), wireframe.degrees
     expected = {
         (i, j)
         for j in range(40)
         for i in range(j)
-        if 4 * pixel <= np.linalg.norm(vertices[i] - vertices[j]) <= LONGEST_PX * pixel
+        if 4 <= 2 * np.linalg.norm(vertices[i] - vertices[j]) / (pixels[i] + pixels[j]) <= LONGEST_PX
         and min(degrees[i], degrees[j]) >= 2
         and (i, j) not in joined
     }
@@ -141,7 +141,8 @@ def test_pairs_are_near_and_open_and_of_vertices_where_edges_meet(generator):
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_no_pairs_of_hardly_any_vertices(count):
-    assert len(open_pairs(Wireframe.loose([Line(np.eye(3)[:2])] * count), 0.001)) == 0
+    wireframe = Wireframe.loose([Line(np.eye(3)[:2])] * count)
+    assert len(open_pairs(wireframe, np.full(len(wireframe.vertices), 0.001))) == 0
 
 
 @pytest.mark.parametrize("pixels", [4.0, 7.3, 60.0])

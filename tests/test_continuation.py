@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from edgel_scenes import pixel_everywhere
 from placed_shapes import PLANE, Placing, any_shape
 
 from taichi_edges.fitting.distances import distances_to
@@ -20,7 +21,7 @@ from taichi_edges.refinement.continuation import (
 
 PIXEL = 0.0025  # unit-cube units: an object as large as an image of 400 pixels
 NOISE = 0.2 * PIXEL
-YARDSTICK = Yardstick(NOISE, PIXEL)
+YARDSTICK, PIXEL_AT = Yardstick(NOISE, PIXEL), pixel_everywhere(PIXEL)
 SEEDS = range(3)
 CHORDAL = 2e-5  # by which places on a chain of cubics seem to be off its chords
 
@@ -112,7 +113,7 @@ WHOLE = {"line": line((0, 0), (0.3, 0)), "arc": arc(0.2, 2.4), "spline": WAVE}
 def test_two_halves_become_one(generator, kind, between, seed):
     whole, cut = WHOLE[kind], generator.uniform(0.3, 0.7)
     strokes, place = strokes_of([part(whole, 0, cut - between / 2), part(whole, cut + between / 2, 1)], generator)
-    found, counts = continued(strokes, YARDSTICK, everywhere)
+    found, counts = continued(strokes, YARDSTICK, PIXEL_AT, everywhere)
     assert [shape.kind for shape in found] == [kind] and counts == Merging(0, 1, 0)
     # Four noises; a chain of cubics that is parametrised anew a few times only is half a pixel short or long besides.
     assert apart(found[0], whole.transformed(place)) < 4 * NOISE + (0.5 * PIXEL if kind == "spline" else 0.0)
@@ -127,7 +128,7 @@ def test_bad_stroke_in_the_middle_is_overruled(generator, kind, seed):
     middle = ends.mean(axis=0) + [0, 0, 2.0 * NOISE]
     bad = Spline(np.array([[ends[0], middle, middle, ends[1]]]))
     strokes, place = strokes_of([part(whole, 0, 0.455), bad, part(whole, 0.545, 1)], generator, 0.2 * NOISE)
-    found, counts = continued(strokes, YARDSTICK, everywhere)
+    found, counts = continued(strokes, YARDSTICK, PIXEL_AT, everywhere)
     assert [shape.kind for shape in found] == [kind] and counts.joined == 2
     assert apart(found[0], whole.transformed(place)) < 3 * NOISE
 
@@ -138,7 +139,7 @@ def test_fillet_between_two_lines_stays_an_arc_between_lines(generator, radius, 
     fillet = arc(-np.pi / 2, 0, radius)
     true = [line((-0.2, -radius), (0, -radius)), fillet, line((radius, 0), (radius, 0.25))]
     strokes, _place = strokes_of([part(shape, 0.02, 0.98) for shape in true], generator, 0.2 * NOISE)
-    found, counts = continued(strokes, YARDSTICK, everywhere)
+    found, counts = continued(strokes, YARDSTICK, PIXEL_AT, everywhere)
     assert sorted(shape.kind for shape in found) == ["arc", "line", "line"] and counts == Merging()
     assert same_places(found, strokes, 1e-12)
 
@@ -147,22 +148,22 @@ def test_fillet_between_two_lines_stays_an_arc_between_lines(generator, radius, 
 def test_gap_that_the_images_do_not_show_stays(generator, seed):
     halves = [line((0, 0), (0.15, 0)), line((0.15 + 8 * PIXEL, 0), (0.35, 0))]
     strokes, _ = strokes_of(halves, generator)
-    assert len(continued(strokes, YARDSTICK, only_along(*strokes))[0]) == 2
-    assert len(continued(strokes, YARDSTICK, everywhere)[0]) == 1
+    assert len(continued(strokes, YARDSTICK, PIXEL_AT, only_along(*strokes))[0]) == 2
+    assert len(continued(strokes, YARDSTICK, PIXEL_AT, everywhere)[0]) == 1
 
 
 def test_gap_wider_than_asked_for_stays(generator):
     halves = [line((0, 0), (0.15, 0)), line((0.15 + 16 * PIXEL, 0), (0.35, 0))]
     strokes, _ = strokes_of(halves, generator)
-    assert len(continued(strokes, YARDSTICK, everywhere)[0]) == 2
-    assert len(continued(strokes, YARDSTICK, everywhere, 24.0)[0]) == 1
+    assert len(continued(strokes, YARDSTICK, PIXEL_AT, everywhere)[0]) == 2
+    assert len(continued(strokes, YARDSTICK, PIXEL_AT, everywhere, 24.0)[0]) == 1
 
 
 @pytest.mark.parametrize("turn", [0.3, 0.6, 1.5])
 def test_corner_stays(generator, turn):
     corner = [line((-0.2, 0), (0, 0)), line((0, 0), (0.2 * np.cos(turn), 0.2 * np.sin(turn)))]
     strokes, _ = strokes_of(corner, generator)
-    found, counts = continued(strokes, YARDSTICK, everywhere)
+    found, counts = continued(strokes, YARDSTICK, PIXEL_AT, everywhere)
     assert same_places(found, strokes, 1e-12) and counts == Merging()
 
 
@@ -172,14 +173,14 @@ def test_each_end_is_continued_once(generator, seed):
     beside = 2.5 * PIXEL
     fork = [line((0, 0), (0.1, 0)), line((0, beside), (0.1, beside)), line((0.11, 0), (0.25, 0))]
     strokes, place = strokes_of(fork, generator, 0.2 * NOISE)
-    found, _ = continued(strokes, YARDSTICK, everywhere)
+    found, _ = continued(strokes, YARDSTICK, PIXEL_AT, everywhere)
     whole = [line((0, 0), (0.25, 0)), fork[1]]
     assert same_places(found, [shape.transformed(place) for shape in whole], 4 * NOISE)
 
 
 def test_ends_continue_each_other_both_ways(generator):
     strokes, _ = strokes_of([part(WHOLE["arc"], a, a + 0.24) for a in (0, 0.25, 0.5, 0.75)], generator)
-    partner = partners_of_ends(strokes, YARDSTICK, 12.0)
+    partner = partners_of_ends(strokes, YARDSTICK, PIXEL_AT, 12.0)
     assert len(partner) == 6 and all(partner[other] == end for end, other in partner.items())
     assert all(end[0] != other[0] for end, other in partner.items())
 
@@ -189,7 +190,7 @@ def test_every_stroke_is_in_one_path_once(generator, seed):
     pieces = [part(WHOLE["arc"], a, a + 0.24) for a in (0, 0.25, 0.5)]
     round = [part(arc(0, 2 * np.pi, 0.05), a, a + 0.33) for a in (0, 1 / 3, 2 / 3)]
     strokes, _ = strokes_of([*pieces, *round, WHOLE["line"], any_shape("circle", generator)], generator)
-    paths = smooth_paths(strokes, YARDSTICK, 12.0)
+    paths = smooth_paths(strokes, YARDSTICK, PIXEL_AT, 12.0)
     assert sorted(number for path, _ in paths for number, _ in path) == list(range(len(strokes)))
     assert sorted((len(path), closes) for path, closes in paths) == [(1, False), (1, False), (3, False), (3, True)]
     for path, _ in paths:
@@ -205,7 +206,7 @@ def test_strokes_that_come_back_to_their_start_are_one_ellipse(generator, pieces
     joints = np.linspace(0.3, 0.3 + 2 * np.pi, pieces + 1)
     strokes = [Spline(whole.over(low + 0.02, high - 0.02).cubics()) for low, high in itertools.pairwise(joints)]
     strokes, _placing = strokes_of(strokes, generator)
-    found, _ = continued(strokes, YARDSTICK, everywhere)
+    found, _ = continued(strokes, YARDSTICK, PIXEL_AT, everywhere)
     assert [shape.kind for shape in found] == ["ellipse"]
     np.testing.assert_allclose(found[0].radii, [0.2, 0.11], atol=NOISE)
 
@@ -215,7 +216,7 @@ def test_strokes_round_a_gap_that_no_image_shows_stay_open(generator, seed):
     whole = EllipticArc(np.zeros(3), np.array([[0.2, 0, 0], [0, 0.11, 0]]), 0.0, 2 * np.pi)
     stroke = whole.over(0.05, 2 * np.pi - 0.05)  # a gap of 4.4 px
     strokes, _ = strokes_of([Spline(stroke.cubics())], generator)
-    found, _ = continued(strokes, YARDSTICK, only_along(*strokes))
+    found, _ = continued(strokes, YARDSTICK, PIXEL_AT, only_along(*strokes))
     assert len(found) == 1 and not found[0].closed
 
 
@@ -228,7 +229,7 @@ def test_parts_of_a_circle_become_the_circle(generator, cuts, seed):
     whole = arc(0, 2 * np.pi)
     parts = [part(whole, a, b - 0.01) for a, b in zip(cuts, (*cuts[1:], 1.0), strict=True)]
     strokes, place = strokes_of(parts, generator, 0.3 * NOISE)
-    found, counts = continued(strokes, YARDSTICK, everywhere)
+    found, counts = continued(strokes, YARDSTICK, PIXEL_AT, everywhere)
     assert [shape.kind for shape in found] == ["circle"] and counts.circles == 1
     assert apart(found[0], whole.transformed(place)) < 2 * NOISE
 
@@ -238,13 +239,13 @@ def test_circle_that_the_images_show_is_completed(generator, seed):
     whole = arc(0, 2 * np.pi)
     (stroke,), place = strokes_of([part(whole, 0, 0.7)], generator, 0.0)
     true = whole.transformed(place)
-    assert [shape.kind for shape in continued([stroke], YARDSTICK, only_along(true))[0]] == ["circle"]
-    assert continued([stroke], YARDSTICK, only_along(stroke))[0] == [stroke]
+    assert [shape.kind for shape in continued([stroke], YARDSTICK, PIXEL_AT, only_along(true))[0]] == ["circle"]
+    assert continued([stroke], YARDSTICK, PIXEL_AT, only_along(stroke))[0] == [stroke]
 
 
 def test_less_than_half_a_circle_says_nothing_of_the_rest(generator):
     (stroke,), _ = strokes_of([arc(0, 0.4 * 2 * np.pi)], generator)
-    assert continued([stroke], YARDSTICK, everywhere)[0] == [stroke]
+    assert continued([stroke], YARDSTICK, PIXEL_AT, everywhere)[0] == [stroke]
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -252,7 +253,7 @@ def test_line_that_touches_a_circle_stays(generator, seed):
     whole = arc(0, 2 * np.pi)
     parts = [part(whole, 0, 0.49), part(whole, 0.5, 0.99), line((0.15, 0), (0.15, 0.2))]
     strokes, _place = strokes_of(parts, generator, 0.3 * NOISE)
-    found, circles = with_whole_circles(strokes, YARDSTICK, everywhere)
+    found, circles = with_whole_circles(strokes, YARDSTICK, PIXEL_AT, everywhere)
     assert circles == 1 and sorted(shape.kind for shape in found) == ["circle", "line"]
 
 
@@ -261,7 +262,7 @@ def test_round_slot_stays_two_arcs_and_two_lines(generator):
     sides = [line((0.05, -0.1), (0.05, 0.1)), line((-0.05, -0.1), (-0.05, 0.1))]
     strokes, _ = strokes_of([part(shape, 0.02, 0.98) for shape in (*ends, *sides)], generator, 0.2 * NOISE)
     seen = only_along(*strokes)
-    found, counts = continued(strokes, YARDSTICK, seen)
+    found, counts = continued(strokes, YARDSTICK, PIXEL_AT, seen)
     assert same_places(found, strokes, 1e-12) and counts == Merging()
 
 
@@ -274,7 +275,7 @@ def test_stroke_beside_a_longer_one_goes(generator, kind, seed):
     whole = WHOLE[kind]
     shorter = part(whole, 0.2, 0.7).transformed(lambda points: points + [0, 0, 1.5 * NOISE])
     strokes, place = strokes_of([whole, shorter], generator, 0.0)
-    found, counts = continued(strokes, YARDSTICK, everywhere)
+    found, counts = continued(strokes, YARDSTICK, PIXEL_AT, everywhere)
     assert counts == Merging(0, 0, 1) and apart(found[0], whole.transformed(place)) < CHORDAL
 
 
@@ -283,23 +284,23 @@ def test_parallel_edges_four_noises_apart_stay(generator, kind):
     whole = WHOLE[kind]
     beside = whole.transformed(lambda points: points + [0, 0, 4 * NOISE])
     strokes, _ = strokes_of([whole, beside], generator, 0.0)
-    assert same_places(continued(strokes, YARDSTICK, everywhere)[0], strokes, 1e-12)
+    assert same_places(continued(strokes, YARDSTICK, PIXEL_AT, everywhere)[0], strokes, 1e-12)
 
 
 def test_stroke_beside_two_others_goes(generator):
     halves = [line((0, 0), (0.2, 0)), line((0.2, 0), (0.4, 0.02))]
     strokes, _ = strokes_of([*halves, line((0.14, 0), (0.24, 0.0022))], generator, 0.0)
-    assert len(without_repeats(strokes, YARDSTICK)) == 2
+    assert len(without_repeats(strokes, YARDSTICK, PIXEL_AT)) == 2
 
 
 def test_short_stroke_across_a_long_one_stays(generator):
     strokes, _ = strokes_of([line((0, 0), (0.3, 0)), line((0.1, -2 * NOISE), (0.1, 2 * NOISE))], generator, 0.0)
-    assert len(without_repeats(strokes, YARDSTICK)) == 2
+    assert len(without_repeats(strokes, YARDSTICK, PIXEL_AT)) == 2
 
 
 def test_stroke_that_goes_on_beyond_its_neighbour_stays(generator):
     strokes, _ = strokes_of([line((0, 0), (0.3, 0)), line((0.25, NOISE), (0.4, NOISE))], generator, 0.0)
-    assert len(without_repeats(strokes, YARDSTICK)) == 2
+    assert len(without_repeats(strokes, YARDSTICK, PIXEL_AT)) == 2
 
 
 # ----------------------------------------------------------------------------------------------------------- in general
@@ -323,30 +324,30 @@ def drawing():
 def test_order_and_direction_of_the_strokes_do_not_matter(generator, seed):
     place = Placing(generator, scale=1.0)
     strokes = [shifted(shape.transformed(place), generator, 0.2 * NOISE) for shape in drawing()]
-    first, counts = continued(strokes, YARDSTICK, everywhere)
+    first, counts = continued(strokes, YARDSTICK, PIXEL_AT, everywhere)
     assert sorted(shape.kind for shape in first) == ["arc", "circle", "line", "line", "spline"]
     assert counts == Merging(1, 2, 1)
     for _ in range(3):
         turned = [backward(shape) if generator.random() < 0.5 else shape for shape in strokes]
-        found, again = continued([turned[n] for n in generator.permutation(8)], YARDSTICK, everywhere)
+        found, again = continued([turned[n] for n in generator.permutation(8)], YARDSTICK, PIXEL_AT, everywhere)
         # The robust fits converge to the same shape but not to the last bit: a hundredth of the noise.
         assert again == counts and same_places(found, first, 0.05 * NOISE)
 
 
 def test_same_twice(generator):
     strokes, _ = strokes_of(drawing(), generator)
-    one, other = (continued(strokes, YARDSTICK, everywhere)[0] for _ in range(2))
+    one, other = (continued(strokes, YARDSTICK, PIXEL_AT, everywhere)[0] for _ in range(2))
     assert all(np.array_equal(polyline(a), polyline(b)) for a, b in zip(one, other, strict=True))
 
 
 def test_continued_edges_stay_as_they_are(generator):
     strokes, _ = strokes_of(drawing(), generator, 0.2 * NOISE)
-    once = continued(strokes, YARDSTICK, everywhere)[0]
-    twice, counts = continued(once, YARDSTICK, everywhere)
+    once = continued(strokes, YARDSTICK, PIXEL_AT, everywhere)[0]
+    twice, counts = continued(once, YARDSTICK, PIXEL_AT, everywhere)
     assert counts == Merging() and same_places(twice, once, CHORDAL)
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_hardly_anything_to_continue(generator, count):
     strokes = [any_shape("spline", generator)] * count
-    assert continued(strokes, YARDSTICK, everywhere) == (strokes, Merging())
+    assert continued(strokes, YARDSTICK, PIXEL_AT, everywhere) == (strokes, Merging())

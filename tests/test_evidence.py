@@ -30,6 +30,12 @@ def matching_of(curves, generator, **settings):
     return EdgelMatching(views_of(curves, generator, **settings))
 
 
+def test_pixel_is_that_of_the_place_and_that_of_the_scene_where_no_view_has_it(taichi, generator):
+    matching = matching_of([A], generator)
+    near, nowhere = np.full(3, 0.5), np.array([0.5, 0.5, 90.0])
+    assert matching.pixel_at(np.array([near, nowhere])).tolist() == [pytest.approx(matching.pixel), matching.pixel]
+
+
 def supported(matching, shapes):
     """The Evidence of each shape."""
     return evidence_of(support_of(matching, shapes))

@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from edgel_scenes import arc, blank_views, line, project_edgels
+from edgel_scenes import arc, blank_views, line, project_edgels, views_of
 
 from taichi_edges.corridor.cluster import cluster
 from taichi_edges.corridor.fit import fit
@@ -17,9 +17,13 @@ from taichi_edges.corridor.pipeline import Run
 from taichi_edges.corridor.refine import refine
 from taichi_edges.corridor.train import train
 from taichi_edges.geometry.bezier import evaluate_bezier
-from taichi_edges.geometry.wireframe import read_wireframe
+from taichi_edges.geometry.shapes import Line
+from taichi_edges.geometry.wireframe import Wireframe, read_wireframe
 from taichi_edges.progress import Progress
 from taichi_edges.readers.scene_checks import into_unit_cube
+from taichi_edges.refinement.stage import refine_wireframe
+from taichi_edges.scene.settings import RefineConfig
+from taichi_edges.synthetic.rendering import look_at
 from taichi_edges.views.cameras import Similarity
 from taichi_edges.views.drawing import draw_edge_maps
 from taichi_edges.views.edgels import Edgels
@@ -137,3 +141,41 @@ def test_resolution_does_not_matter(usual, tmp_path, times):
     """But for free ends, which are known to half a pixel."""
     views = views_of_part(round(SIZE * times))
     assert_same(usual, found(tmp_path, views), 0.7 * max(pixel_size(views), pixel_size(views_of_part(SIZE))))
+
+
+# --------------------------------------------------------------------------------------------------- near and far
+
+FOCAL, STAND, ASIDE_PX = 400.0, np.array([-1.0, 0.5, 0.5]), 75.0
+STROKES_PX = [  # away from the cameras, sideways, upwards; edgels are where these are and nowhere else
+    *([(0, -50, 40), (0, -7, 40)], [(0, 0, 33), (0, 0, -10)]),  # they meet: each is 7 px short of at most 8
+    *([(0, -50, -30), (0, -20, -30)], [(1.3, -20, -30), (1.3, -20, 5)]),  # do not: 1.3 px apart, where at most 1 is
+    *([(0, -10, -50), (0, 50, -50)], [(0.4, 30, -50), (0.4, 30, -20)]),  # one touches the other: 0.4 px of at most 0.5
+]
+
+
+def strokes_at(depth, side):
+    """Lines so far away whose pictures from STAND, to one side of what is there, depend on that in nothing else."""
+    ways = np.array(STROKES_PX) + [0, side * ASIDE_PX, 0]
+    return [Line(STAND + depth * (np.array([1.0, 0, 0]) + way / FOCAL)) for way in ways]
+
+
+def cameras_around(count=16, radius=0.45):
+    """Cameras on a circle about STAND that look at the middle of the cube."""
+    angles = np.arange(count) / count * 2 * np.pi
+    places = STAND + radius * np.stack([0 * angles, np.cos(angles), np.sin(angles)], axis=1)
+    lens = np.array([[FOCAL, 0, 199.5], [0, FOCAL, 199.5], [0, 0, 1]])
+    return np.repeat(lens[None], count, axis=0), np.array([look_at(place, np.full(3, 0.5)) for place in places])
+
+
+def test_how_far_away_edges_are_does_not_matter(taichi, generator):
+    """A few, and the same twice as far away and as large. A pixel at the scene is larger than at the near ones by half,
+    and smaller than at the far ones by a quarter.
+    """
+    strokes = [*strokes_at(1.0, -1), *strokes_at(2.0, 1)]
+    curves = [lambda s, shape=shape: shape.at(np.asarray(s)) for shape in strokes]
+    views = views_of(curves, generator, cameras=cameras_around(), count=16)
+    found, _ = refine_wireframe(Wireframe.loose(strokes), views, RefineConfig(enabled=True, verdict=False))
+    is_near = np.array([shape.at(0.5)[0] < 0.5 for shape in found.shapes])
+    for some in (found.keep(is_near), found.keep(~is_near)):
+        assert len(some) == 6 and len(some.vertices) == 11 and len(some.contacts) == 1
+        assert np.bincount([end for edge in some.edges for end in edge.vertices]).max() == 2  # so one pair meets

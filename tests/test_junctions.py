@@ -4,6 +4,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from edgel_scenes import pixel_everywhere
 from placed_shapes import PLANE, Placing, any_shape
 
 from taichi_edges.fitting.distances import distances_to
@@ -11,6 +12,7 @@ from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
 from taichi_edges.refinement.junctions import MEETING_PX, REACH_PX, connected
 
 PIXEL = 0.0025  # unit-cube units
+PIXEL_AT = pixel_everywhere(PIXEL)
 SEEDS = range(4)
 OFF = 0.15  # pixels: how far places of an edge are off, usually
 
@@ -71,7 +73,7 @@ def nearest(points, wanted):
 def test_cube_closes(generator, along, seed):
     lines, corners = box([-0.15, -0.2, -0.1], [0.15, 0.2, 0.1])
     shapes, place = loosened(lines, generator, along)
-    found = connected(shapes, PIXEL)
+    found = connected(shapes, PIXEL_AT)
     check(found, shapes)
     assert len(found.vertices) == 8 and (found.degrees == 3).all() and len(found.contacts) == 0
     # Two of the three lines say where a corner is along each axis, each off by OFF: 5.7 standard deviations.
@@ -83,7 +85,7 @@ def test_thin_plate_closes_on_both_sides(generator, seed):
     """Corners as near to each other as the reach of an end: 6 px."""
     lines, corners = box([-0.15, -0.2, 0], [0.15, 0.2, 6 * PIXEL])
     shapes, place = loosened(lines, generator, 1.5)
-    found = connected(shapes, PIXEL)
+    found = connected(shapes, PIXEL_AT)
     check(found, shapes)
     assert len(found.vertices) == 8 and (found.degrees == 3).all()
     assert nearest(found.vertices, place(corners)).max() < 4 * OFF * PIXEL
@@ -93,20 +95,20 @@ def test_thin_plate_closes_on_both_sides(generator, seed):
 def test_exact_corners_stay_exact(generator, seed):
     lines, corners = box([-0.15, -0.2, -0.1], [0.15, 0.2, 0.1])
     shapes, place = loosened(lines, generator, 0.0, 0.0)
-    assert nearest(connected(shapes, PIXEL).vertices, place(corners)).max() < 1e-9
+    assert nearest(connected(shapes, PIXEL_AT).vertices, place(corners)).max() < 1e-9
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_order_of_the_edges_does_not_matter(generator, seed):
     shapes, _ = loosened(box([-0.15, -0.2, -0.1], [0.15, 0.2, 0.1])[0], generator)
     order = generator.permutation(12)
-    one, other = connected(shapes, PIXEL), connected([shapes[n] for n in order], PIXEL)
+    one, other = connected(shapes, PIXEL_AT), connected([shapes[n] for n in order], PIXEL_AT)
     assert nearest(other.vertices, one.vertices).max() < 0.05 * PIXEL
 
 
 def test_same_twice(generator):
     shapes, _ = loosened(box([-0.15, -0.2, -0.1], [0.15, 0.2, 0.1])[0], generator)
-    np.testing.assert_array_equal(connected(shapes, PIXEL).vertices, connected(shapes, PIXEL).vertices)
+    np.testing.assert_array_equal(connected(shapes, PIXEL_AT).vertices, connected(shapes, PIXEL_AT).vertices)
 
 
 @pytest.mark.parametrize("gap", [2.5, 3.5])
@@ -115,7 +117,7 @@ def test_ends_farther_than_they_reach_stay_free(generator, gap):
     shapes, _ = loosened(
         [line((gap * REACH_PX * PIXEL, 0, 0), (0.3, 0, 0)), line((0, 0, 0), (0, 0.3, 0))], generator, 0, 0
     )
-    found = connected(shapes, PIXEL)
+    found = connected(shapes, PIXEL_AT)
     check(found, shapes)
     assert (found.degrees == 1).all() and len(found.contacts) == 0
     np.testing.assert_array_equal(found.vertices, np.concatenate([shape.ends for shape in shapes]))
@@ -124,7 +126,7 @@ def test_ends_farther_than_they_reach_stay_free(generator, gap):
 def test_lines_that_pass_each_other_stay_free(generator):
     """Askew, four pixels apart where they come nearest."""
     shapes, _ = loosened([line((0, 0, 0), (0.3, 0, 0)), line((0, 0, 4 * PIXEL), (0, 0.3, 4 * PIXEL))], generator, 0, 0)
-    assert (connected(shapes, PIXEL).degrees == 1).all()
+    assert (connected(shapes, PIXEL_AT).degrees == 1).all()
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -135,7 +137,7 @@ def test_parallel_bars_keep_their_ends(generator, apart, seed):
     shapes, place = loosened(
         [*bars, line((0, 0, 0), (0, 0, 0.2)), line((0.3, apart * PIXEL, 0), (0.3, 0.2, 0.1))], generator, 1.0
     )
-    found = connected(shapes, PIXEL)
+    found = connected(shapes, PIXEL_AT)
     check(found, shapes)
     for edge, before in zip(found.edges[:2], bars, strict=True):
         assert np.linalg.norm(edge.shape.ends - place(before.points), axis=1).max() < (1.0 + 5 * OFF) * PIXEL
@@ -147,7 +149,7 @@ def test_parallel_bars_keep_their_ends(generator, apart, seed):
 def test_lines_side_by_side_do_not_meet(generator):
     pair = [line((0, 0, 0), (0.3, 0, 0)), line((0, 0.8 * PIXEL, 0), (0.3, 0.8 * PIXEL, 0))]
     shapes, _ = loosened(pair, generator, 0, 0)
-    assert len(connected(shapes, PIXEL).vertices) == 4
+    assert len(connected(shapes, PIXEL_AT).vertices) == 4
 
 
 @pytest.mark.parametrize("kind", ["line", "arc", "spline"])
@@ -157,7 +159,7 @@ def test_no_edge_ends_twice_in_one_vertex(generator, kind):
         middle = shape.at(0.5)
         small = shape.transformed(lambda points, s=4 * PIXEL / shape.length: middle + s * (points - middle))
         stem = line(small.ends[0], small.ends[0] + [0.1, 0.2, 0.1])
-        found = connected([small, stem, line(small.ends[1], small.ends[1] - [0.2, 0.1, 0.1])], PIXEL)
+        found = connected([small, stem, line(small.ends[1], small.ends[1] - [0.2, 0.1, 0.1])], PIXEL_AT)
         assert all(len(set(edge.vertices)) == 2 for edge in found.edges)
 
 
@@ -170,7 +172,7 @@ def test_line_meets_its_fillet_in_the_tangent_point(generator, radius, seed):
     fillet = EllipticArc(np.zeros(3), radius * PLANE, -np.pi / 2, 0.0)
     true = [line((-0.2, -radius, 0), (0, -radius, 0)), fillet, line((radius, 0, 0), (radius, 0.25, 0))]
     shapes, place = loosened(true, generator, 2.0, 0.05)
-    found = connected(shapes, PIXEL)
+    found = connected(shapes, PIXEL_AT)
     check(found, shapes)
     assert len(found.vertices) == 4 and np.sort(found.degrees).tolist() == [1, 1, 2, 2]
     joints = found.vertices[found.degrees == 2]
@@ -189,7 +191,7 @@ def test_arc_keeps_its_side(generator, angle, seed):
     arc = EllipticArc(np.zeros(3), 0.1 * PLANE, 0.0, angle)
     lines = [line(end, end + [0, 0, way]) for end, way in zip(arc.ends, (0.2, -0.2), strict=True)]
     shapes, place = loosened([arc, *lines], generator, 2.0)
-    found = connected(shapes, PIXEL)
+    found = connected(shapes, PIXEL_AT)
     check(found, shapes)
     assert (found.degrees == 2).sum() == 2
     assert found.shapes[0].length == pytest.approx(shapes[0].length, abs=6 * PIXEL)
@@ -209,7 +211,7 @@ def test_other_curves_end_exactly_where_they_meet(generator, kind, seed):
         start = stem.points[0] + generator.uniform(0.2, 3.0) * PIXEL * way / np.linalg.norm(way)
         stems[number] = line(start, start + 0.2 * way / np.linalg.norm(way))
     shapes = [curve, *stems]
-    found = connected(shapes, PIXEL)
+    found = connected(shapes, PIXEL_AT)
     check(found, shapes)
     assert (found.degrees == 2).sum() == 2
     if kind == "spline":
@@ -233,7 +235,7 @@ def test_end_on_the_middle_of_an_edge_is_a_contact(generator, kind, seed):
         way /= np.linalg.norm(way)
         far = place + 0.3 * way
     start = place + generator.uniform(-4, 4) * PIXEL * way
-    found = connected([touched, line(start, far)], PIXEL)
+    found = connected([touched, line(start, far)], PIXEL_AT)
     check(found, [touched, line(start, far)])
     vertex, edge = found.contacts[0]
     assert len(found.contacts) == 1 and edge == 0 and vertex == found.edges[1].vertices[0]
@@ -245,7 +247,7 @@ def test_corner_on_a_face_of_another_part_is_one_contact(generator, seed):
     """Two lines meet in a third one, between its ends."""
     true = [line((-0.2, 0, 0), (0.2, 0, 0)), line((0, 0, 0), (0, 0.2, 0)), line((0, 0, 0), (0.05, 0, 0.2))]
     shapes, _place = loosened(true, generator, 2.0, 0.1)
-    found = connected(shapes, PIXEL)
+    found = connected(shapes, PIXEL_AT)
     check(found, shapes)
     assert len(found.vertices) == 5 and len(found.contacts) == 1 and found.contacts[0, 1] == 0
     assert found.degrees[found.contacts[0, 0]] == 3
@@ -253,13 +255,13 @@ def test_corner_on_a_face_of_another_part_is_one_contact(generator, seed):
 
 def test_end_near_nothing_is_free(generator):
     shapes = [line((0, 0, 0), (0.3, 0, 0)), line((0.1, 12 * PIXEL, 0), (0.1, 0.2, 0))]
-    found = connected(shapes, PIXEL)
+    found = connected(shapes, PIXEL_AT)
     assert len(found.contacts) == 0 and (found.degrees == 1).all()
 
 
 @pytest.mark.parametrize("shapes", [[], [any_shape("circle", np.random.default_rng(0))], [Line(np.eye(3)[:2])]])
 def test_hardly_anything_to_connect(shapes):
-    found = connected(shapes, PIXEL)
+    found = connected(shapes, PIXEL_AT)
     check(found, shapes)
     assert found.vertices.shape == (2 * sum(not shape.closed for shape in shapes), 3)
     assert len(found) == len(shapes) and found.contacts.shape == (0, 2)
@@ -267,4 +269,4 @@ def test_hardly_anything_to_connect(shapes):
 
 def test_closed_spline_stays_as_it_is(generator):
     loop = any_shape("loop", generator)
-    assert isinstance(loop, Spline) and connected([loop], PIXEL).shapes == [loop]
+    assert isinstance(loop, Spline) and connected([loop], PIXEL_AT).shapes == [loop]

@@ -15,7 +15,7 @@ from taichi_edges.arrays.robust import NORMAL_MAD, geman_mcclure
 from taichi_edges.evidence.edgel_matching import EdgelMatching
 from taichi_edges.evidence.lying import EdgelsAbout, steadiness
 from taichi_edges.evidence.noise import BEST_SUPPORTED, noise_of_best_agreeing
-from taichi_edges.geometry.shapes import Shape
+from taichi_edges.geometry.shapes import Shape, middles_of
 from taichi_edges.geometry.wireframe import Evidence
 from taichi_edges.views.edgels import MOST_SINE
 
@@ -46,9 +46,10 @@ class EdgeSamples:
     starts: np.ndarray
 
     @staticmethod
-    def along(shapes: Sequence[Shape], spacing: float) -> "EdgeSamples":
-        """Samples of shapes, about `spacing` apart (units of their frame), one for each shape at least."""
-        parameters = [spaced(shape, spacing) for shape in shapes]
+    def along(shapes: Sequence[Shape], spacing: float | np.ndarray) -> "EdgeSamples":
+        """Samples of shapes, one for each at least. spacing: units of their frame, of all, or (E,) of each."""
+        spacings = np.broadcast_to(spacing, len(shapes)).tolist()
+        parameters = [spaced(shape, own) for shape, own in zip(shapes, spacings, strict=True)]
         counts = np.array([len(some) for some in parameters], dtype=np.int64)
         pairs = list(zip(shapes, parameters, strict=True))
         return EdgeSamples(
@@ -193,7 +194,7 @@ def support_of(matching: EdgelMatching, shapes: Sequence[Shape], radius: float =
     The noise can make an edgel nearer to the wrong one of two edges, so an edge with fewer views on its length than the
     best one counts as farther away, by up to TIE_NOISES times the noise.
     """
-    samples = EdgeSamples.along(shapes, SPACING_PX * matching.pixel)
+    samples = EdgeSamples.along(shapes, SPACING_PX * matching.pixel_at(middles_of(shapes)))
     found = EdgelsAbout.of(matching, samples.points, samples.directions, radius)
     nearest = _owned(matching, samples, found, np.zeros(len(shapes)))
     strengths = samples.sums(nearest.views) / np.maximum(np.diff(samples.starts), 1)

@@ -15,7 +15,7 @@ from taichi_edges.evidence.plane_equations import GRADIENT, NUMBERS, VIEWS, WEIG
 from taichi_edges.kernels.device import download, upload
 from taichi_edges.kernels.edgel_grid import EdgelGrid, cells_around
 from taichi_edges.kernels.points import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D, blocks_of, load_camera, load_point
-from taichi_edges.views.cameras import NEAR
+from taichi_edges.views.cameras import NEAR, Cameras
 from taichi_edges.views.edgels import MOST_SINE
 from taichi_edges.views.views import Views, pixel_size
 
@@ -32,9 +32,9 @@ geman_mcclure = ti.func(FunctionType(_weight.__code__, {}, _weight.__name__, _we
 class EdgelMatching:
     """Matches points that know their direction with the edgels of all views.
 
-    edgels: those of the views. pixel: size of a pixel at the scene, unit-cube units. scale_px: residual at which the
-    weight of an edgel has fallen to a quarter. least_views: that show an edge which goes on, each counted by
-    its weight.
+    edgels: those of the views. pixel: size of a pixel at the scene, unit-cube units, see `pixel_at`. scale_px: residual
+    at which the weight of an edgel has fallen to a quarter. least_views: that show an edge which goes on, each counted
+    by its weight.
     """
 
     def __init__(self, views: Views, least_views: float = LEAST_VIEWS) -> None:
@@ -49,6 +49,17 @@ class EdgelMatching:
     def projections(self) -> np.ndarray:
         """(V, 3, 4) intrinsics @ world_to_camera, rounded to float32 as the kernels have them."""
         return download(self.cameras).astype(np.float64)
+
+    @cached_property
+    def every_camera(self) -> Cameras:
+        """The Cameras of `projections`."""
+        return Cameras.of(self.projections)
+
+    def pixel_at(self, points: np.ndarray) -> np.ndarray:
+        """(n,) size of a pixel at each of (n, 3) points, see `Cameras.pixel_at`; at the scene where no view has it."""
+        height, width = self.size
+        sizes = self.every_camera.pixel_at(points, width, height)
+        return np.where(np.isnan(sizes), self.pixel, sizes)
 
     @cached_property
     def neighbors(self) -> np.ndarray:

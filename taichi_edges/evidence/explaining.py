@@ -30,13 +30,13 @@ def explained_support(matching: "EdgelMatching", refined: "RefinedPoints") -> np
     along the line; a point beside the owner, on the same edge in 3D, shares it. Strength is the support, then what a
     point was found to own in the round before.
     """
-    owned, count = refined.support, len(refined)
+    owned, count, pixel = refined.support, len(refined), matching.pixel_at(refined.points)
     beside = max(BESIDE_PX, BESIDE_NOISES * _noise(matching, refined.keep(_best(owned))))
     for _ in range(ROUNDS):
         owners = _owners(matching, refined, owned + 1e-3 * refined.support)
         shared, seen = np.zeros(count), np.zeros(count)
         for part in _in_parts(matching, refined, MATCH_PX):
-            shared += (_whose(matching, refined, owners, part.edgels, beside) > 0).sum(axis=1)
+            shared += (_whose(pixel, refined, owners, part.edgels, beside) > 0).sum(axis=1)
             seen += part.inside.sum(axis=1)
         owned = shared / np.maximum(seen, 1)
     return owned
@@ -69,11 +69,11 @@ def _owners(matching: "EdgelMatching", refined: "RefinedPoints", strength: np.nd
 
 
 def _whose(
-    matching: "EdgelMatching", refined: "RefinedPoints", owners: np.ndarray, matches: np.ndarray, beside: float
+    pixel: np.ndarray, refined: "RefinedPoints", owners: np.ndarray, matches: np.ndarray, beside: float
 ) -> np.ndarray:
     """(n, v) int: 1 where the matched edgel is the point's own, -1 where it is another edge's, 0 no edgel or owner.
 
-    beside: px; so far across its direction another point is on the same edge.
+    pixel: (n,) size of one at each point. beside: px; so far across its direction another point is on the same edge.
     """
     whose = np.zeros(matches.shape, np.int8)
     at, column = np.nonzero(matches >= 0)
@@ -82,8 +82,8 @@ def _whose(
     apart, direction = refined.points[owner] - refined.points[at], refined.directions[at]
     along = (apart * direction).sum(axis=1)
     across = np.linalg.norm(apart - along[:, None] * direction, axis=1)
-    reach = matching.pixel * np.array([beside, ALONG_PX])
-    whose[at, column] = np.where((across <= reach[0]) & (np.abs(along) <= reach[1]), 1, -1)
+    same = (across <= beside * pixel[at]) & (np.abs(along) <= ALONG_PX * pixel[at])
+    whose[at, column] = np.where(same, 1, -1)
     return whose
 
 

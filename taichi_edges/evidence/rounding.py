@@ -17,7 +17,6 @@ from taichi_edges.evidence.edgel_matching import EdgelMatching, is_inside, proje
 from taichi_edges.kernels.device import download, upload
 from taichi_edges.kernels.edgel_grid import cells_around
 from taichi_edges.kernels.points import F32_2D, F32_3D, I32_1D, blocks_of, load_camera, load_point
-from taichi_edges.views.cameras import Cameras
 
 AROUND_PX = 8.0  # edgels so far to the side of a place are looked at
 MOST_AROUND = 6  # of them in each view
@@ -54,7 +53,6 @@ def offsets_around(
     columns: ti.i32,
     starts: I32_1D,
     elements: F32_2D,
-    pixel: ti.f32,
     offsets: F32_3D,
     angles: F32_2D,
 ):
@@ -77,7 +75,7 @@ def offsets_around(
                 towards = ti.Vector([centres[view, a] for a in ti.static(range(3))]) - place
                 angles[i, view] = ti.atan2(towards.dot(second), towards.dot(first))
                 if front and is_inside(pixel_at, height, width):
-                    side = slopes @ (direction.cross(towards).normalized() * pixel)
+                    side = slopes @ direction.cross(towards)
                     across = ti.Vector([-along[1], along[0]])
                     if across.dot(side) < 0:
                         across = -across
@@ -145,8 +143,8 @@ def rounding_at(matching: EdgelMatching, points: np.ndarray, directions: np.ndar
     places, ways = (upload(np.ascontiguousarray(array, np.float32)) for array in (points, directions))
     grid = (matching.grid.rows, matching.grid.columns, matching.grid.starts, matching.grid.elements)
     if count:
-        centres = upload(Cameras.of(matching.projections).centres.astype(np.float32))
-        scene = (matching.cameras, centres, *matching.size, *grid, matching.pixel)
+        centres = upload(matching.every_camera.centres.astype(np.float32))
+        scene = (matching.cameras, centres, *matching.size, *grid)
         offsets_around(*blocks_of(places), places, ways, *scene, offsets, angles)
     offsets, angles = download(offsets), download(angles)
     best = upload(np.zeros((count, 3), np.float32))

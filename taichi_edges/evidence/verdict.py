@@ -21,7 +21,7 @@ from taichi_edges.evidence.edgel_matching import EdgelMatching
 from taichi_edges.evidence.lying import EdgelsAbout, steadiness
 from taichi_edges.evidence.noise import ON_NOISES
 from taichi_edges.evidence.rounding import rounding_at
-from taichi_edges.geometry.shapes import Shape
+from taichi_edges.geometry.shapes import Shape, middles_of
 
 SPACING_PX = 1.0  # of the places on an edge that are looked at
 TIGHT_NOISES = 3.0  # within so much of an edge its edgels lie on it
@@ -78,7 +78,8 @@ def marks_of(matching: EdgelMatching, shapes: Sequence[Shape], noise_px: float) 
     the share that an edge does. outside: px by which an edge lies beyond the outline of the object, 0 where pictures
     show none: the line about which the contours of a round lie is outside, seen along the round.
     """
-    return marks_along(matching, EdgeSamples.along(shapes, SPACING_PX * matching.pixel), noise_px)
+    samples = EdgeSamples.along(shapes, SPACING_PX * matching.pixel_at(middles_of(shapes)))
+    return marks_along(matching, samples, noise_px)
 
 
 def marks_along(matching: EdgelMatching, samples: EdgeSamples, noise_px: float) -> np.ndarray:

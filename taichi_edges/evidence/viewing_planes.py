@@ -53,11 +53,12 @@ def refine_points(
     """
     scale = matching.scale_px if scale is None else scale
     points, directions = np.array(points, np.float64), np.array(directions, np.float64)
+    pixel = matching.pixel_at(points)[:, None]
     for radius in radii:
         equations = matching.equations(points, directions, radius, scale)
         steps, directions = _solve(equations, directions)
         lengths = np.linalg.norm(steps, axis=1, keepdims=True)
-        points += steps * np.minimum(1.0, radius * matching.pixel / np.maximum(lengths, 1e-300))
+        points += steps * np.minimum(1.0, radius * pixel / np.maximum(lengths, 1e-300))
     equations = matching.equations(points, directions, radii[-1], scale)
     values = np.linalg.eigh(equations.matrices)[0]
     spread, views = np.maximum(values[:, 1], 0.0) / np.maximum(values[:, 2], 1e-12), equations.weights

@@ -1,6 +1,7 @@
-"""Distances of points to the shapes of edges, their ends included."""
+"""Distances of points to the shapes of edges, their ends included, and to each other."""
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from taichi_edges.fitting.cubic_chains import nearest_on_chain
 from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline
@@ -36,6 +37,14 @@ def _distances_to_ellipse(shape: EllipticArc, points: np.ndarray) -> np.ndarray:
     t = middle + (t - middle + np.pi) % (2 * np.pi) - np.pi
     t = np.clip(t, shape.low, shape.high)
     return np.linalg.norm(points - shape.at((t - shape.low) / (shape.high - shape.low)), axis=1)
+
+
+def pairs_within(places: np.ndarray, reaches: np.ndarray) -> np.ndarray:
+    """(k, 2) pairs, in order, of (n, 3) places no farther apart than the mean of their (n,) reaches."""
+    pairs = cKDTree(places).query_pairs(reaches.max(initial=0.0), output_type="ndarray")
+    pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+    apart = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
+    return pairs[apart <= reaches[pairs].mean(axis=1)]
 
 
 def unit(vector: np.ndarray) -> np.ndarray:

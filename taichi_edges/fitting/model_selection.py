@@ -25,11 +25,12 @@ STRETCH_PX = 4.0  # length of an edge on which the errors go together
 FEWEST_PLACES = 8  # on a shape, however short it is
 
 Fit = Callable[[], Shape | None]
+PixelAt = Callable[[np.ndarray], np.ndarray]  # (n,) size of a pixel at (n, 3) places, unit-cube units
 
 
 @dataclass(frozen=True)
 class Yardstick:
-    """What counts as a difference. noise: of a place on an edge, across it. pixel: size of a pixel at the scene.
+    """What counts as a difference. noise: of a place on an edge, across it. pixel: size of a pixel there.
 
     Both in units of the unit cube.
     """
@@ -41,6 +42,10 @@ class Yardstick:
     def stretch(self) -> float:
         """Length of one observation."""
         return STRETCH_PX * self.pixel
+
+    def at(self, pixel: float) -> "Yardstick":
+        """The same where a pixel is so large."""
+        return Yardstick(self.noise * (pixel / self.pixel), pixel)
 
 
 @dataclass(frozen=True)

@@ -233,6 +233,11 @@ def bounds_of(shapes: Sequence[Shape]) -> np.ndarray:
     return corners
 
 
+def middles_of(shapes: Sequence[Shape]) -> np.ndarray:
+    """(S, 3) places halfway along shapes."""
+    return np.array([shape.at(0.5) for shape in shapes]).reshape(-1, 3)
+
+
 def near_bounds(bounds: np.ndarray, points: np.ndarray, margin: float) -> np.ndarray:
     """Indices of the boxes (S, 2, 3) that come nearer than `margin` to the box of (n, 3) points."""
     apart = np.maximum(bounds[:, 0] - points.max(axis=0), points.min(axis=0) - bounds[:, 1]).max(axis=1)

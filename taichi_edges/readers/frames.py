@@ -155,12 +155,12 @@ def build_views(
         box=similarity.to_unit(np.asarray(box, dtype=np.float64)),
         input_to_truth=frames.input_to_truth,
         edgels=edgels,
-        pixel=None if points is None else pixel_at(points, intrinsics, moved, (width, height)),
+        pixel=None if points is None else scene_pixel(points, intrinsics, moved, (width, height)),
         tolerance_px=config.tolerance_px,
     )
 
 
-def pixel_at(
+def scene_pixel(
     points: np.ndarray, intrinsics: np.ndarray, world_to_camera: np.ndarray, size: tuple[int, int]
 ) -> float | None:
     """Size of a pixel at the points in sight, (n, 3) unit cube: median over the views of each view's median; or None.

@@ -26,7 +26,7 @@ from scipy.sparse.linalg import spsolve
 
 from taichi_edges.arrays.robust import widening
 from taichi_edges.evidence.edge_support import SPACING_PX, EdgeSamples, support_of
-from taichi_edges.geometry.shapes import Shape
+from taichi_edges.geometry.shapes import Shape, middles_of
 from taichi_edges.geometry.wireframe import Wireframe
 from taichi_edges.refinement.charts import derivatives, moved, nearest_parameters, neighbors, own_unknowns
 
@@ -143,12 +143,13 @@ def solve(matrix: csc_matrix, gradient: np.ndarray, free: np.ndarray) -> np.ndar
 class Problem:
     """What stays the same during an adjustment.
 
-    start: the Wireframe it begins with. layout: of its unknowns. pixel: unit-cube units. relations: Constraints.
+    start: the Wireframe it begins with. layout: of its unknowns. pixels: (E,) size of one at each edge, unit-cube
+    units. relations: Constraints.
     """
 
     start: Wireframe
     layout: Layout
-    pixel: float
+    pixels: np.ndarray
     relations: tuple[Constraint, ...] = ()
 
 
@@ -165,7 +166,8 @@ def adjusted(
     if not len(wireframe):
         return wireframe
     wireframe = replace(wireframe, edges=tuple(replace(edge, evidence=None) for edge in wireframe.edges))
-    problem = Problem(wireframe, Layout.of(wireframe), matching.pixel, tuple(relations))
+    pixels = matching.pixel_at(middles_of(wireframe.shapes))
+    problem = Problem(wireframe, Layout.of(wireframe), pixels, tuple(relations))
     for radius in radii:
         image = image_equations(problem, wireframe, matching, radius)
         wireframe = _stepped(problem, wireframe, image)
@@ -174,13 +176,12 @@ def adjusted(
 
 def image_equations(problem: Problem, wireframe: Wireframe, matching: "EdgelMatching", radius: float) -> Equations:
     """Equations of the edgels, the start and the free ends."""
-    shapes, pixel = wireframe.shapes, problem.pixel
-    support = support_of(matching, shapes, radius)
+    support = support_of(matching, wireframe.shapes, radius)
     samples = support.samples
     noise = max(support.noise_px, LEAST_NOISE_PX)
     widest = matching.scale_px
     scale = widest if radius > TIGHT_RADIUS_PX else min(widest, SCALE_NOISES * noise)
-    counted = _counted(wireframe, samples, pixel) * support.certainty  # what agrees by chance says nothing
+    counted = _counted(wireframe, samples, problem.pixels) * support.certainty  # what agrees by chance says nothing
     said = matching.equations_of(samples.points, support.edgels, scale)
     said = said.weighed(counted * SPACING_PX / CORRELATED_PX / noise**2)
     planes, pulls = _across(said, samples.directions)
@@ -190,24 +191,25 @@ def image_equations(problem: Problem, wireframe: Wireframe, matching: "EdgelMatc
         parameters = samples.parameters[part]
         slopes = derivatives(neighbors_of(wireframe, number), methodcaller("at", parameters))  # (n, 3, k)
         before = samples.points[part] - problem.start.edges[number].shape.at(parameters)
-        weight = 1.0 / (len(before) * (START_PX * pixel) ** 2)
+        weight = 1.0 / (len(before) * (START_PX * problem.pixels[number]) ** 2)
         _add_places(equations, unknowns, slopes, planes[part] + weight * np.eye(3), pulls[part] + weight * before)
-    _pin_free_ends(equations, wireframe, problem.start, PIN_PX * pixel)
+    _pin_free_ends(equations, wireframe, problem.start, PIN_PX * problem.pixels)
     return equations
 
 
-def _counted(wireframe: Wireframe, samples: EdgeSamples, pixel: float) -> np.ndarray:
+def _counted(wireframe: Wireframe, samples: EdgeSamples, pixels: np.ndarray) -> np.ndarray:
     """(n,) float: 0 for samples too near to an end of their edge, or to a vertex that touches it; 1 otherwise."""
     counted = np.ones(len(samples))
     for number, edge in enumerate(wireframe.edges):
         part = samples.of(number)
         if not edge.shape.closed:
-            margin = min(END_PX * pixel / max(edge.shape.length, 1e-300), MOST_ENDS)
+            margin = min(END_PX * pixels[number] / max(edge.shape.length, 1e-300), MOST_ENDS)
             position = (np.arange(part.stop - part.start) + 0.5) / (part.stop - part.start)
             counted[part] = (position >= margin) & (position <= 1 - margin)
     for vertex, number in wireframe.contacts:
         part = samples.of(number)
-        counted[part] *= np.linalg.norm(samples.points[part] - wireframe.vertices[vertex], axis=1) > END_PX * pixel
+        away = np.linalg.norm(samples.points[part] - wireframe.vertices[vertex], axis=1)
+        counted[part] *= away > END_PX * pixels[number]
     return counted
 
 
@@ -226,10 +228,13 @@ def _add_places(
     equations.add_block(unknowns, flat.T @ weighted, flat.T @ gradients.ravel())
 
 
-def _pin_free_ends(equations: Equations, wireframe: Wireframe, start: Wireframe, deviation: float) -> None:
-    """A vertex in which a single edge ends, and which touches no other, does not move along that edge."""
+def _pin_free_ends(equations: Equations, wireframe: Wireframe, start: Wireframe, deviations: np.ndarray) -> None:
+    """A vertex in which a single edge ends, and which touches no other, does not move along that edge.
+
+    deviations: (E,).
+    """
     degrees = wireframe.degrees
-    for edge in wireframe.edges:
+    for edge, deviation in zip(wireframe.edges, deviations.tolist(), strict=True):
         for end, vertex in enumerate(edge.vertices):
             if degrees[vertex] == 1:
                 along = edge.shape.tangents(np.array([float(end)]))
@@ -255,14 +260,14 @@ def _stepped(problem: Problem, wireframe: Wireframe, image: Equations) -> Wirefr
     image: Equations at the Wireframe.
     """
     layout, start = problem.layout, problem.start.shapes
-    constraints = [*smooth_joints(wireframe), *contacts(wireframe, problem.pixel), *problem.relations]
+    constraints = [*smooth_joints(wireframe), *contacts(wireframe, problem.pixels), *problem.relations]
     joined = constrained(layout, wireframe, constraints)
     matrix, target = image.matrix() + joined.matrix(), image.target + joined.target
     free = np.ones(layout.size, bool)
     while free.any():
         there = layout.moved(wireframe, solve(matrix, target, free))
         pairs = enumerate(zip(start, there.shapes, strict=True))
-        lost = [number for number, pair in pairs if _is_lost(*pair, MOST_PX * problem.pixel)]
+        lost = [number for number, pair in pairs if _is_lost(*pair, MOST_PX * problem.pixels[number])]
         lost = [number for number in lost if free[layout.columns[number]].any()]
         if not lost:
             return there
@@ -281,7 +286,7 @@ def _is_lost(before: Shape, after: Shape, most: float) -> bool:
 def _polished(problem: Problem, wireframe: Wireframe, matrix: csc_matrix) -> Wireframe:
     """The Wireframe moved to where the hard constraints hold exactly, by as little as `matrix` (of the edgels) says."""
     for _ in range(POLISHING):
-        constraints = [c for c in (*contacts(wireframe, problem.pixel), *problem.relations) if c.hard]
+        constraints = [c for c in (*contacts(wireframe, problem.pixels), *problem.relations) if c.hard]
         if not constraints:
             break
         joined = constrained(problem.layout, wireframe, constraints, HARD)
@@ -375,8 +380,8 @@ def _turn(end: int, other_end: int) -> Callable[[Shape, Shape], np.ndarray]:
     return values
 
 
-def contacts(wireframe: Wireframe, pixel: float) -> Iterator[Constraint]:
-    """Constraints of the vertices that touch edges. pixel: unit-cube units."""
+def contacts(wireframe: Wireframe, pixels: np.ndarray) -> Iterator[Constraint]:
+    """Constraints of the vertices that touch edges. pixels: (E,) size of one at each edge, unit-cube units."""
     ending: dict[int, tuple[int, int]] = {}
     for number, edge in enumerate(wireframe.edges):
         for end, vertex in enumerate(edge.vertices):
@@ -385,7 +390,8 @@ def contacts(wireframe: Wireframe, pixel: float) -> Iterator[Constraint]:
         if vertex in ending and ending[vertex][0] != number:
             touched, place = wireframe.edges[number].shape, wireframe.vertices[vertex]
             values = _offset(touched, ending[vertex][1], nearest_parameters(touched, place[None]))
-            yield Constraint((ending[vertex][0], number), values, CONTACT_PX * pixel, hard=True)
+            both = (ending[vertex][0], number)
+            yield Constraint(both, values, CONTACT_PX * float(pixels[list(both)].mean()), hard=True)
 
 
 def _offset(touched: Shape, end: int, parameters: np.ndarray) -> Callable[[Shape, Shape], np.ndarray]:

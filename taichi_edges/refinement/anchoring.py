@@ -19,10 +19,9 @@ from taichi_edges.arrays.columns import Columns
 from taichi_edges.arrays.ranges import ragged, starts_of
 from taichi_edges.evidence.edge_support import Support, support_of
 from taichi_edges.evidence.lying import EdgelsAbout
-from taichi_edges.geometry.shapes import Line, Shape
+from taichi_edges.geometry.shapes import Line, Shape, middles_of
 from taichi_edges.refinement.anchors import BEYOND_PX, Anchors, anchors_of
 from taichi_edges.refinement.straight_runs import LEAST_LENGTH_PX, StraightRuns, runs_of
-from taichi_edges.views.cameras import Cameras
 
 if TYPE_CHECKING:
     from taichi_edges.evidence.edgel_matching import EdgelMatching
@@ -50,9 +49,9 @@ def anchored_lines(matching: "EdgelMatching", shapes: Sequence[Shape]) -> list[L
     """
     if not shapes:
         return []
-    cameras, support = Cameras.of(matching.projections), support_of(matching, shapes)
+    cameras, support = matching.every_camera, support_of(matching, shapes)
     runs = runs_of(matching.edgels, support.claims.owners < 0)
-    anchors = anchors_of(runs, shapes, cameras, matching.pixel)
+    anchors = anchors_of(runs, shapes, cameras, matching.pixel_at(middles_of(shapes)))
     lines: list[Line] = []
     for number in range(ROUNDS):
         support = support_of(matching, [*shapes, *lines]) if number else support
@@ -60,7 +59,8 @@ def anchored_lines(matching: "EdgelMatching", shapes: Sequence[Shape]) -> list[L
         found = distinct(shown(matching, hypotheses(runs, anchors), free, seen_in(support)), matching, free)
         if not found:
             break
-        anchors = anchors.with_further(anchors_of(runs, found, cameras, matching.pixel), len(shapes) + len(lines))
+        further = anchors_of(runs, found, cameras, matching.pixel_at(middles_of(found)))
+        anchors = anchors.with_further(further, len(shapes) + len(lines))
         lines += found
     return lines
 
@@ -74,7 +74,8 @@ class Lines(Columns):
 
     points: (n, 2, 3) two anchors that they pass through. extents: (n, 2) parameters of their ends, 0 and 1 at these.
     shapes: (n, 2) those that these are on. views: (n,) of the runs. closed: (n,) how many ends of the run are anchors,
-    0 to 2, each the less the farther it is. sizes: (n,) of a pixel there, unit-cube units.
+    0 to 2, each the less the farther it is. pixels: (n,) size of one there, in
+    these views, unit-cube units.
     """
 
     points: np.ndarray
@@ -82,7 +83,7 @@ class Lines(Columns):
     shapes: np.ndarray
     views: np.ndarray
     closed: np.ndarray
-    sizes: np.ndarray
+    pixels: np.ndarray
 
     @property
     def ways(self) -> np.ndarray:
@@ -98,7 +99,7 @@ class Lines(Columns):
     def at_anchors(self) -> np.ndarray:
         """(n, 2) bool: is an end as near to its anchor as edges are that meet?"""
         off = np.abs(self.extents - [0.0, 1.0]) * np.linalg.norm(self.ways, axis=1)[:, None]
-        return off <= BEYOND_PX * self.sizes[:, None]
+        return off <= BEYOND_PX * self.pixels[:, None]
 
     @property
     def lengths(self) -> np.ndarray:
@@ -121,9 +122,9 @@ def hypotheses(runs: StraightRuns, anchors: Anchors) -> Lines:
 
 def proposed(runs: StraightRuns, anchors: Anchors) -> list[Lines]:
     """Lists of Lines for r StraightRuns with c anchors each. anchors: Anchors with arrays (r, c, ..)."""
-    lengths, points, ways, sizes = runs.lengths, anchors.points, anchors.ways, anchors.sizes
+    lengths, points, ways, pixels = runs.lengths, anchors.points, anchors.ways, anchors.pixels
     first, second = np.triu_indices(points.shape[1], 1)
-    agree = on_lines(points, first, second, sizes)  # (r, p, c)
+    agree = on_lines(points, first, second, pixels)  # (r, p, c)
     far = ways[:, second] - ways[:, first]
     enough = far >= APART_SHARE * lengths[:, None]
     worth = np.where(enough, agree.sum(axis=2) + 0.25 * np.minimum(far / lengths[:, None], 2.0), 0.0)
@@ -133,34 +134,34 @@ def proposed(runs: StraightRuns, anchors: Anchors) -> list[Lines]:
         mine, pair = rows[worth[rows, best] > 0], best[worth[rows, best] > 0]
         ends = np.column_stack([first[pair], second[pair]])
         chosen = (mine[:, None], ends)
-        extents, usable = extents_of(lengths[mine], ways[chosen], sizes[chosen])
+        extents, usable = extents_of(lengths[mine], ways[chosen], pixels[chosen])
         gaps = np.abs(ways[chosen] - np.stack([np.zeros(len(mine)), lengths[mine]], axis=1))
         closed = np.maximum(1.0 - gaps / BEYOND_PX, 0.0).sum(axis=1)
-        of = anchors.shapes[chosen], runs.views[mine], closed, sizes[chosen].mean(axis=1)
+        of = anchors.shapes[chosen], runs.views[mine], closed, pixels[chosen].mean(axis=1)
         found.append(Lines(points[chosen], extents, *of).keep(usable))
         implied = ~(agree & ~agree[rows, best][:, None]).any(axis=2)  # nothing agrees that does not with the best
         worth = np.where(implied, 0.0, worth)
     return found
 
 
-def on_lines(points: np.ndarray, first: np.ndarray, second: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """(r, p, c) bool: do anchors, (r, c, 3), lie on the lines through pairs of them? sizes: (r, c) of a pixel."""
+def on_lines(points: np.ndarray, first: np.ndarray, second: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """(r, p, c) bool: do anchors, (r, c, 3), lie on the lines through pairs of them? pixels: (r, c) size of one."""
     start, way = points[:, first], points[:, second] - points[:, first]
     way = way / np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-300)
     offsets = points[:, None] - start[:, :, None]
     offsets = offsets - np.einsum("rpck,rpk->rpc", offsets, way)[..., None] * way[:, :, None]
-    return np.linalg.norm(offsets, axis=3) <= AGREEING_PX * sizes[:, None]
+    return np.linalg.norm(offsets, axis=3) <= AGREEING_PX * pixels[:, None]
 
 
-def extents_of(lengths: np.ndarray, ways: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def extents_of(lengths: np.ndarray, ways: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(r, 2) parameters of the ends of runs on lines in space, and (r,) bool, whether they are in front of the camera.
 
-    lengths: (r,) px. ways: (r, 2) px along the run of the places with parameter 0 and 1. sizes: (r, 2) of a pixel
+    lengths: (r,) px. ways: (r, 2) px along the run of the places with parameter 0 and 1. pixels: (r, 2) size of one
     there, which are as their depths. A line's places in the image are a projective function of those in space.
     """
     ends = np.stack([np.zeros(len(lengths)), lengths], axis=1)
-    near = (ends - ways[:, :1]) * sizes[:, :1]
-    below = near + (ways[:, 1:] - ends) * sizes[:, 1:]
+    near = (ends - ways[:, :1]) * pixels[:, :1]
+    below = near + (ways[:, 1:] - ends) * pixels[:, 1:]
     with np.errstate(divide="ignore", invalid="ignore"):
         extents = near / below
     return extents, (below > 0).all(axis=1) & (extents[:, 1] > extents[:, 0])
@@ -185,7 +186,7 @@ class Sightings:
     @staticmethod
     def of(matching: "EdgelMatching", lines: Lines, free: np.ndarray, spacing: float) -> "Sightings":
         """spacing: px. free: (e,) bool, the edgels that count."""
-        counts = np.maximum(np.round(lines.lengths / (spacing * lines.sizes)), 4).astype(np.int64)
+        counts = np.maximum(np.round(lines.lengths / (spacing * lines.pixels)), 4).astype(np.int64)
         owners, number = ragged(counts)
         share = (number + 0.5) / counts[owners]
         parameters = lines.extents[owners, 0] + share * np.diff(lines.extents, axis=1)[owners, 0]
@@ -244,7 +245,7 @@ def clipped(lines: Lines, sightings: Sightings, enough: np.ndarray) -> tuple[Lin
     shown = np.bincount(sightings.lines, enough, len(lines)) > 0
     lines = replace(lines, extents=extents)
     lines = replace(lines, extents=np.where(lines.at_anchors, [0.0, 1.0], extents))
-    return lines, shown & (lines.lengths >= LEAST_LENGTH_PX * lines.sizes)
+    return lines, shown & (lines.lengths >= LEAST_LENGTH_PX * lines.pixels)
 
 
 # ------------------------------------------------------------------------------------------------- each edge once
@@ -271,7 +272,7 @@ def distinct(lines: Lines, matching: "EdgelMatching", free: np.ndarray) -> list[
             continue
         best = int(np.bincount(others[others >= 0]).argmax())
         along, apart = beside(lines, np.array([best]), lines.ends[line][None])
-        if apart[0] <= REPEAT_PX * lines.sizes[best]:
+        if apart[0] <= REPEAT_PX * lines.pixels[best]:
             extents[best] = min(extents[best, 0], along.min()), max(extents[best, 1], along.max())
             owners[found[others < 0]] = best
     ends = replace(lines, extents=extents).ends
@@ -302,7 +303,7 @@ class LineVotes:
         total, common = np.asarray(owned.sum(axis=1))[:, 0], (owned @ owned.T).tocoo()
         alike = common.data >= OVERLAP * np.minimum(total[common.row], total[common.col])
         one, other = common.row[alike], common.col[alike]
-        same = beside(lines, one, lines.ends[other])[1] <= SAME_PX * lines.sizes[one]
+        same = beside(lines, one, lines.ends[other])[1] <= SAME_PX * lines.pixels[one]
         votes = votes_of(one[same], lines.views[other[same]], len(lines))
         closed = np.bincount(one[same], lines.closed[other[same]], len(lines))
         worth = votes + closed / np.maximum(np.bincount(one[same], minlength=len(lines)), 1)

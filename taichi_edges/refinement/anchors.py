@@ -26,14 +26,14 @@ class Anchors(Columns):
     """Where runs meet known shapes in the image, sorted by the run.
 
     runs, shapes: (n,) indices. points: (n, 3) on the shape, in the run's viewing plane. ways: (n,) px along the run.
-    sizes: (n,) size of a pixel there, unit-cube units.
+    pixels: (n,) size of one there, in the run's view, unit-cube units.
     """
 
     runs: np.ndarray
     shapes: np.ndarray
     points: np.ndarray
     ways: np.ndarray
-    sizes: np.ndarray
+    pixels: np.ndarray
 
     def sorted(self) -> "Anchors":
         """The same in order of their runs, and along these."""
@@ -44,9 +44,9 @@ class Anchors(Columns):
         return Anchors.joined([self, replace(others, shapes=others.shapes + count)]).sorted()
 
 
-def anchors_of(runs: "StraightRuns", shapes: Sequence[Shape], cameras: "Cameras", pixel: float) -> Anchors:
-    """The Anchors of StraightRuns on shapes. pixel: unit-cube units."""
-    pieces = pieces_of(shapes, pixel)
+def anchors_of(runs: "StraightRuns", shapes: Sequence[Shape], cameras: "Cameras", pixels: np.ndarray) -> Anchors:
+    """The Anchors of StraightRuns on shapes. pixels: (S,) size of one at each shape, unit-cube units."""
+    pieces = pieces_of(shapes, pixels)
     found, piece = near_pairs(runs, pieces, cameras)
     views, starts = runs.views[found], runs.ends[found, 0]
     middles, halves = pieces.points[piece], pieces.halves[piece]
@@ -59,10 +59,10 @@ def anchors_of(runs: "StraightRuns", shapes: Sequence[Shape], cameras: "Cameras"
     within = np.abs(steps) <= 1.0 + 1e-6
     found, piece, views, steps = found[within], piece[within], views[within], steps[within]
     points = middles[within] + steps[:, None] * halves[within]
-    pixels, depths = cameras.project(points, views)
+    places, depths = cameras.project(points, views)
     ahead, _ = cameras.project(points + halves[within], views)
-    ways = ((pixels - starts[within]) * runs.along[found]).sum(axis=1)
-    heading = (ahead - pixels) / np.linalg.norm(ahead - pixels, axis=1, keepdims=True)
+    ways = ((places - starts[within]) * runs.along[found]).sum(axis=1)
+    heading = (ahead - places) / np.linalg.norm(ahead - places, axis=1, keepdims=True)
     sine = np.abs(heading[:, 0] * runs.along[found][:, 1] - heading[:, 1] * runs.along[found][:, 0])
     good = (sine >= LEAST_CROSSING) & (ways >= -BEYOND_PX) & (ways <= runs.lengths[found] + BEYOND_PX)
     anchors = Anchors(found, pieces.shapes[piece], points, ways, depths / cameras.focal[views]).keep(good)
@@ -90,10 +90,10 @@ class ShapePieces:
     shapes: np.ndarray
 
 
-def pieces_of(shapes: Sequence[Shape], pixel: float) -> ShapePieces:
-    """The ShapePieces of shapes; lines and arcs go on a little beyond their ends."""
+def pieces_of(shapes: Sequence[Shape], pixels: np.ndarray) -> ShapePieces:
+    """The ShapePieces of shapes; lines and arcs go on a little beyond their ends. pixels: as of `anchors_of`."""
     points, halves, counts = [np.zeros((0, 3))], [np.zeros((0, 3))], []
-    for shape in shapes:
+    for shape, pixel in zip(shapes, pixels.tolist(), strict=True):
         beyond = BEYOND_PX * pixel / shape.length if shape.kind in ("line", "arc") else 0.0
         count = max(int(np.ceil(shape.length * (1 + 2 * beyond) / (SHAPE_PX * pixel))), 1)
         bounds = shape.at(np.linspace(-beyond, 1 + beyond, count + 1))

@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from taichi_edges.evidence.edge_support import Claims, claims_of, support_along
 from taichi_edges.evidence.lying import EdgelsAbout, steadiness
-from taichi_edges.fitting.distances import distances_to
+from taichi_edges.fitting.distances import distances_to, pairs_within
 from taichi_edges.geometry.shapes import Line, Shape, bounds_of, near_bounds
 from taichi_edges.geometry.wireframe import Edge, Wireframe
 
@@ -30,13 +29,14 @@ MOST_PAIRS = 20_000  # the nearest ones, so that a large scene does not take lon
 
 def completed(wireframe: Wireframe, matching: "EdgelMatching") -> tuple[Wireframe, int]:
     """The Wireframe with the missing lines, and how many there were. matching: EdgelMatching."""
-    pairs = open_pairs(wireframe, matching.pixel)
+    pixels = matching.pixel_at(wireframe.vertices)
+    pairs = open_pairs(wireframe, pixels)
     if not len(pairs):
         return wireframe, 0
     claims, found = claims_of(matching, wireframe.shapes), []
     for first, second in pairs.tolist():
         line = Line(wireframe.vertices[[first, second]])
-        places = clear_places(line, matching.pixel)
+        places = clear_places(line, pixels[[first, second]].mean())
         views = support_along(matching, line, places, claims)
         if (views >= matching.least_views).mean() >= SHOWN and steadiness_of_line(
             matching, line, places, claims
@@ -44,10 +44,10 @@ def completed(wireframe: Wireframe, matching: "EdgelMatching") -> tuple[Wirefram
             found.append((float(views.mean()), first, second))
     edges = list(wireframe.edges)
     for _, first, second in sorted(found, reverse=True):
-        line = Line(wireframe.vertices[[first, second]])
+        line, pixel = Line(wireframe.vertices[[first, second]]), pixels[[first, second]].mean()
         others = np.delete(wireframe.vertices, [first, second], axis=0)
-        passes = len(others) and distances_to(line, others).min() <= matching.pixel  # two lines meet there, if any
-        if not passes and not repeats(line, [edge.shape for edge in edges], matching.pixel):
+        passes = len(others) and distances_to(line, others).min() <= pixel  # two lines meet there, if any
+        if not passes and not repeats(line, [edge.shape for edge in edges], pixel):
             edges.append(Edge(line, (first, second)))
     return Wireframe(wireframe.vertices, tuple(edges), wireframe.contacts), len(edges) - len(wireframe)
 
@@ -69,13 +69,16 @@ def steadiness_of_line(matching: "EdgelMatching", line: Line, places: np.ndarray
     return steadiness((free & found.within(ON_PX)).sum(), free.sum())
 
 
-def open_pairs(wireframe: Wireframe, pixel: float) -> np.ndarray:
-    """(k, 2) pairs of vertices that are near each other, in which edges meet, and that no edge joins."""
-    pairs = cKDTree(wireframe.vertices).query_pairs(LONGEST_PX * pixel, output_type="ndarray")
+def open_pairs(wireframe: Wireframe, pixels: np.ndarray) -> np.ndarray:
+    """(k, 2) pairs of vertices that are near each other, in which edges meet, and that no edge joins.
+
+    pixels: (V,) size of one at each vertex.
+    """
+    pairs = pairs_within(wireframe.vertices, LONGEST_PX * pixels)
     lengths = np.linalg.norm(wireframe.vertices[pairs[:, 0]] - wireframe.vertices[pairs[:, 1]], axis=1)
     joined = {tuple(sorted(edge.vertices)) for edge in wireframe.edges if edge.vertices}
     new = np.array([tuple(sorted(pair)) not in joined for pair in pairs.tolist()], dtype=bool)
-    good = new & (lengths >= SHORTEST_PX * pixel) & (wireframe.degrees[pairs] >= 2).all(axis=1)
+    good = new & (lengths >= SHORTEST_PX * pixels[pairs].mean(axis=1)) & (wireframe.degrees[pairs] >= 2).all(axis=1)
     order = np.lexsort((pairs[good, 1], pairs[good, 0], lengths[good]))
     return pairs[good][order][:MOST_PAIRS]
 

@@ -3,6 +3,8 @@
 Three passes. An arc whose circle goes on along other strokes becomes that circle. Strokes that follow each other
 smoothly form a path, and the path is cut anew into as few shapes as pay (`model_selection`), by dynamic programming
 over all ways to cut it. A stroke that lies beside others on its whole length repeats them.
+
+Each Yardstick is that of the place: halfway along a stroke, at an end; of several in the mean of their pixels.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,10 +16,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from taichi_edges.fitting.arcs import fit_arc, through_three
-from taichi_edges.fitting.distances import distances_to, unit
-from taichi_edges.fitting.model_selection import Track, Yardstick, best_shape, misfit, observations, track_of
+from taichi_edges.fitting.distances import distances_to, pairs_within, unit
+from taichi_edges.fitting.model_selection import PixelAt, Track, Yardstick, best_shape, misfit, observations, track_of
 from taichi_edges.fitting.prices import price_of
-from taichi_edges.geometry.shapes import EllipticArc, Shape, bounds_of, near_bounds
+from taichi_edges.geometry.shapes import EllipticArc, Shape, bounds_of, middles_of, near_bounds
 
 BESIDE = 3.0  # noises: places so near to a shape are on it
 PARALLEL = np.cos(np.radians(20.0))
@@ -81,16 +83,16 @@ class Cut(NamedTuple):
 
 
 def continued(
-    shapes: Sequence[Shape], yardstick: Yardstick, seen: Seen, gap_px: float = CONTINUED_GAP_PX
+    shapes: Sequence[Shape], yardstick: Yardstick, pixel_at: PixelAt, seen: Seen, gap_px: float = CONTINUED_GAP_PX
 ) -> tuple[list[Shape], Merging]:
     """The shapes after all three passes, and Merging.
 
-    shapes: list of shapes in the unit cube. yardstick: Yardstick. seen: function of a shape and (n,) parameters that
+    shapes: list of shapes in the unit cube. yardstick: of the scene. seen: function of a shape and (n,) parameters that
     tells how many views see an edge there, (n,). gap_px: between strokes that continue each other, at most.
     """
-    rounded, circles = with_whole_circles(shapes, yardstick, seen)
-    chained = rejoined(rounded, yardstick, seen, gap_px)
-    single = without_repeats(chained, yardstick)
+    rounded, circles = with_whole_circles(shapes, yardstick, pixel_at, seen)
+    chained = rejoined(rounded, yardstick, pixel_at, seen, gap_px)
+    single = without_repeats(chained, yardstick, pixel_at)
     joined = len(shapes) - len(chained)
     return single, Merging(circles, joined, len(chained) - len(single))
 
@@ -98,28 +100,36 @@ def continued(
 # --------------------------------------------------------------------------------------------------- whole circles
 
 
-def with_whole_circles(shapes: Sequence[Shape], yardstick: Yardstick, seen: Seen) -> tuple[list[Shape], int]:
+def yardsticks_at(places: np.ndarray, yardstick: Yardstick, pixel_at: PixelAt) -> list[Yardstick]:
+    """The Yardstick at each of (n, 3) places. yardstick: of the scene."""
+    return [yardstick.at(pixel) for pixel in pixel_at(places).tolist()]
+
+
+def with_whole_circles(
+    shapes: Sequence[Shape], yardstick: Yardstick, pixel_at: PixelAt, seen: Seen
+) -> tuple[list[Shape], int]:
     """The shapes, arcs replaced by the circle they are parts of where that goes on; and how many circles that gave."""
     arcs = {n: shape for n, shape in enumerate(shapes) if isinstance(shape, EllipticArc) and shape.kind == "arc"}
     if not arcs:
         return list(shapes), 0
     circles: list[Shape] = []
     gone: set[int] = set()
-    strokes = [Stroke(shape, track_of(shape, yardstick.pixel)) for shape in shapes]
+    yardsticks = yardsticks_at(middles_of(shapes), yardstick, pixel_at)
+    strokes = [Stroke(shape, track_of(shape, own.pixel)) for shape, own in zip(shapes, yardsticks, strict=True)]
     places, alive = Places([stroke.track for stroke in strokes]), np.array([not shape.closed for shape in shapes])
     for number in sorted(arcs, key=lambda n: -arcs[n].length):
         if number in gone:
             continue
-        alive[list(gone)] = False
-        circle = circle_around(arcs[number], places, alive, yardstick)
+        alive[list(gone)], own = False, yardsticks[number]
+        circle = circle_around(arcs[number], places, alive, own)
         if circle is None:
             continue
-        others = np.unique(places.owners[places.about(circle, BESIDE * yardstick.noise, alive)]).tolist()
-        on = {n: on_shape(circle, strokes[n].track, yardstick) for n in others}
+        others = np.unique(places.owners[places.about(circle, BESIDE * own.noise, alive)]).tolist()
+        on = {n: on_shape(circle, strokes[n].track, own) for n in others}
         parts = [n for n in others if on[n].mean() >= REPEATED]
-        if number not in parts or not is_cheaper(circle, [strokes[n] for n in parts], yardstick):
+        if number not in parts or not is_cheaper(circle, [strokes[n] for n in parts], own):
             continue
-        if goes_on(circle, np.concatenate([strokes[n].track.points[on[n]] for n in others]), yardstick, seen, COVERED):
+        if goes_on(circle, np.concatenate([strokes[n].track.points[on[n]] for n in others]), own, seen, COVERED):
             circles.append(circle)
             gone.update(parts)
     return [shape for n, shape in enumerate(shapes) if n not in gone] + circles, len(circles)
@@ -213,15 +223,17 @@ def on_shape(shape: Shape, track: Track, yardstick: Yardstick) -> np.ndarray:
 
 
 def rejoined(
-    shapes: Sequence[Shape], yardstick: Yardstick, seen: Seen, gap_px: float = CONTINUED_GAP_PX
+    shapes: Sequence[Shape], yardstick: Yardstick, pixel_at: PixelAt, seen: Seen, gap_px: float = CONTINUED_GAP_PX
 ) -> list[Shape]:
     """The shapes, each path of strokes that continue each other cut anew into as few as pay."""
     whole: list[Shape] = []
-    spacing = SPACING_PX * yardstick.pixel
-    for path, closes in smooth_paths(shapes, yardstick, gap_px):
+    pixels = pixel_at(middles_of(shapes))
+    for path, closes in smooth_paths(shapes, yardstick, pixel_at, gap_px):
+        own = yardstick.at(float(pixels[[n for n, _ in path]].mean()))
+        spacing = SPACING_PX * own.pixel
         strokes = [Stroke(shapes[n], oriented(track_of(shapes[n], spacing), backward)) for n, backward in path]
-        loop = closed_shape(strokes, yardstick, seen) if closes else None
-        whole += [loop] if loop is not None else cut_anew(strokes, yardstick, seen)
+        loop = closed_shape(strokes, own, seen) if closes else None
+        whole += [loop] if loop is not None else cut_anew(strokes, own, seen)
     return whole
 
 
@@ -234,9 +246,9 @@ def closed_shape(strokes: Sequence[Stroke], yardstick: Yardstick, seen: Seen) ->
     return shape if shape is not None and replaces(shape, strokes, yardstick, seen) else None
 
 
-def smooth_paths(shapes: Sequence[Shape], yardstick: Yardstick, gap_px: float) -> list[SmoothPath]:
+def smooth_paths(shapes: Sequence[Shape], yardstick: Yardstick, pixel_at: PixelAt, gap_px: float) -> list[SmoothPath]:
     """The SmoothPaths of shapes; every shape is in one of them."""
-    partner = partners_of_ends(shapes, yardstick, gap_px)
+    partner = partners_of_ends(shapes, yardstick, pixel_at, gap_px)
     paths: list[SmoothPath] = []
     seen: set[int] = set()
     ends = [(number, side) for number, shape in enumerate(shapes) for side in (0, 1)]
@@ -255,25 +267,28 @@ def smooth_paths(shapes: Sequence[Shape], yardstick: Yardstick, gap_px: float) -
     return paths
 
 
-def partners_of_ends(shapes: Sequence[Shape], yardstick: Yardstick, gap_px: float) -> dict[ShapeEnd, ShapeEnd]:
+def partners_of_ends(
+    shapes: Sequence[Shape], yardstick: Yardstick, pixel_at: PixelAt, gap_px: float
+) -> dict[ShapeEnd, ShapeEnd]:
     """{(shape, side): (shape, side)} of ends that continue each other, each the best for the other."""
     ends = [(number, side) for number, shape in enumerate(shapes) if not shape.closed for side in (0, 1)]
     if len(ends) < 2:
         return {}
     places = np.array([shapes[number].ends[side] for number, side in ends])
     outward = np.array([(2 * side - 1) * shapes[number].tangents(float(side)) for number, side in ends])
-    found, gap = [], gap_px * yardstick.pixel
-    for i, j in sorted(cKDTree(places).query_pairs(gap)):
-        same = ends[i][0] == ends[j][0] and shapes[ends[i][0]].length < LEAST_LOOP * gap
+    found, pixels = [], pixel_at(places)
+    for i, j in pairs_within(places, gap_px * pixels).tolist():
+        own = yardstick.at(float(pixels[[i, j]].mean()))
+        same = ends[i][0] == ends[j][0] and shapes[ends[i][0]].length < LEAST_LOOP * gap_px * own.pixel
         if same or outward[i] @ outward[j] > -CONTINUED_COSINE:
             continue
         step = places[j] - places[i]
         along = unit(outward[i] - outward[j])
         aside = np.linalg.norm(step - (step @ along) * along)
-        if aside <= BESIDE * yardstick.noise + CONTINUED_ASIDE * abs(step @ along):
+        if aside <= BESIDE * own.noise + CONTINUED_ASIDE * abs(step @ along):
             turn = np.arccos(np.clip(-outward[i] @ outward[j], -1, 1))
-            ahead = abs(step @ along) / (4 * yardstick.pixel)
-            found.append((aside / yardstick.noise + turn / np.radians(5.0) + ahead, i, j))
+            ahead = abs(step @ along) / (4 * own.pixel)
+            found.append((aside / own.noise + turn / np.radians(5.0) + ahead, i, j))
     partner: dict[ShapeEnd, ShapeEnd] = {}
     for _, i, j in sorted(found):
         if ends[i] not in partner and ends[j] not in partner:
@@ -345,15 +360,16 @@ def joined_track(strokes: Sequence[Stroke]) -> Track:
 # --------------------------------------------------------------------------------------------------------- repeats
 
 
-def without_repeats(shapes: Sequence[Shape], yardstick: Yardstick) -> list[Shape]:
+def without_repeats(shapes: Sequence[Shape], yardstick: Yardstick, pixel_at: PixelAt) -> list[Shape]:
     """The shapes without those that lie beside longer ones on their whole length."""
     kept: set[int] = set()
-    bounds = bounds_of(shapes)
+    bounds, yardsticks = bounds_of(shapes), yardsticks_at(middles_of(shapes), yardstick, pixel_at)
     for number in sorted(range(len(shapes)), key=lambda number: -shapes[number].length):
-        track = track_of(shapes[number], yardstick.pixel)
-        near = kept & set(near_bounds(bounds, track.points, BESIDE * yardstick.noise).tolist())
+        own = yardsticks[number]
+        track = track_of(shapes[number], own.pixel)
+        near = kept & set(near_bounds(bounds, track.points, BESIDE * own.noise).tolist())
         others = [shapes[other] for other in sorted(near)]
-        if not others or beside_others(track, others, yardstick).mean() < REPEATED:
+        if not others or beside_others(track, others, own).mean() < REPEATED:
             kept.add(number)
     return [shapes[number] for number in sorted(kept)]
 

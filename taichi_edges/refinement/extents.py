@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline
+from taichi_edges.fitting.model_selection import PixelAt
+from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline, middles_of
 from taichi_edges.refinement.continuation import GAP_SEEN, LEAST_GAP_VIEWS
 
 AHEAD_PX = 40.0  # looked beyond an end; a longer way takes another round
@@ -20,7 +21,7 @@ def extended(
     shapes: Sequence[Shape],
     sides: Sequence[Sequence[int]],
     seen: Callable[[list[int], list[Question]], list[np.ndarray]],
-    pixel: float,
+    pixel_at: PixelAt,
 ) -> list[Shape]:
     """Lines and arcs, their ends on the given sides moved outwards as far as the images show them; others as they are.
 
@@ -28,7 +29,7 @@ def extended(
     now: how many views see an edge there that is nobody else's. One step of all shapes at a time is asked about.
     """
     found = list(shapes)
-    steps = {n: _steps(shape, own, pixel) for n, (shape, own) in enumerate(zip(shapes, sides, strict=True)) if own}
+    steps = {n: _steps(shape, own, pixel_at) for n, (shape, own) in enumerate(zip(shapes, sides, strict=True)) if own}
     answers: dict[int, Any] = dict.fromkeys(steps)
     while steps:
         questions: dict[int, Question] = {}
@@ -43,15 +44,16 @@ def extended(
     return found
 
 
-def _steps(shape: Shape, sides: Sequence[int], pixel: float) -> Generator[Question, Any, Shape]:
+def _steps(shape: Shape, sides: Sequence[int], pixel_at: PixelAt) -> Generator[Question, Any, Shape]:
     """Generator that asks how many views see places, (shape, parameters), and returns the extended shape."""
     if isinstance(shape, Spline) or shape.kind not in ("line", "arc"):
         return shape
-    inside = np.linspace(0.05, 0.95, max(int(shape.length / pixel), 5))
+    inside = np.linspace(0.05, 0.95, max(int(shape.length / pixel_at(middles_of([shape]))[0]), 5))
     least = max(GAP_SEEN * np.median((yield shape, inside)), LEAST_GAP_VIEWS)
-    ways = np.arange(1.0, AHEAD_PX + 1.0) * pixel
     for side in sides:
         for _ in range(ROUNDS):
+            pixel = float(pixel_at(shape.ends[[side]])[0])
+            ways = np.arange(1.0, AHEAD_PX + 1.0) * pixel
             views = yield shape, side + (2 * side - 1) * ways / shape.length
             ahead = shown(ways, views >= least, pixel)
             if ahead <= 0 or turned_round(shape, ahead):

@@ -3,20 +3,20 @@
 An end may move along its edge, outwards or inwards, by as much as detectors lose near a corner or trace beyond it. Two
 ends meet where their edges come nearest within that reach; where they run into each other tangentially, the place is
 where their tangents agree. Pairs are joined best first, as long as one point is near to all the edges that meet in it.
-An end that meets no other may lie on another edge between that one's ends: a T-junction, a contact.
+An end that meets no other may lie on another edge between that one's ends: a T-junction, a contact. All that is said
+in pixels is in those of the place: of several ends in the mean of theirs.
 """
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from taichi_edges.fitting.arcs import through_three
 from taichi_edges.fitting.cubic_chains import lsq_chain, nearest_on_chain
-from taichi_edges.fitting.distances import distances_to
-from taichi_edges.fitting.model_selection import track_of
-from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline, bounds_of, near_bounds
+from taichi_edges.fitting.distances import distances_to, pairs_within
+from taichi_edges.fitting.model_selection import PixelAt, track_of
+from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline, bounds_of, middles_of, near_bounds
 from taichi_edges.geometry.wireframe import Edge, Wireframe
 
 REACH_PX = 8.0  # by which an end may move along its edge
@@ -37,11 +37,12 @@ Group = dict[int, float]  # ends that meet, indices, and the way of each
 class Reach:
     """The places within reach of one end, side 0 or 1, of the edge of some number.
 
-    ways: (m,) outwards along the edge. points, tangents: (m, 3), outwards.
+    pixel: size of one at the end. ways: (m,) outwards along the edge. points, tangents: (m, 3), outwards.
     """
 
     edge: int
     side: int
+    pixel: float
     ways: np.ndarray
     points: np.ndarray
     tangents: np.ndarray
@@ -58,16 +59,17 @@ class Meeting:
     smooth: bool
 
 
-def connected(shapes: Sequence[Shape], pixel: float) -> Wireframe:
-    """The Wireframe of shapes, whose ends meet where they can. pixel: size of a pixel, unit-cube units."""
-    open_shapes = [(number, shape) for number, shape in enumerate(shapes) if not shape.closed]
-    reaches = [reach_of(number, shape, side, pixel) for number, shape in open_shapes for side in (0, 1)]
-    groups = grouped(reaches, meetings(reaches, pixel), pixel)
+def connected(shapes: Sequence[Shape], pixel_at: PixelAt) -> Wireframe:
+    """The Wireframe of shapes, whose ends meet where they can."""
+    ends = [(number, side) for number, shape in enumerate(shapes) if not shape.closed for side in (0, 1)]
+    pixels = pixel_at(np.array([shapes[number].ends[side] for number, side in ends]).reshape(-1, 3)).tolist()
+    reaches = [reach_of(number, shapes[number], side, own) for (number, side), own in zip(ends, pixels, strict=True)]
+    groups = grouped(reaches, meetings(reaches))
     places = [meeting_point([(reaches[end], way) for end, way in group.items()]) for group in groups]
     at = {(reaches[end].edge, reaches[end].side): number for number, group in enumerate(groups) for end in group}
-    vertices, contacts = with_contacts(shapes, reaches, groups, np.array(places).reshape(-1, 3), pixel)
+    vertices, contacts = with_contacts(shapes, reaches, groups, np.array(places).reshape(-1, 3))
     edges = []
-    for number, shape in enumerate(shapes):
+    for number, (shape, pixel) in enumerate(zip(shapes, pixel_at(middles_of(shapes)).tolist(), strict=True)):
         own = () if shape.closed else (at[number, 0], at[number, 1])
         edges.append(Edge(between(shape, vertices[list(own)], pixel) if own else shape, own))
     return Wireframe(vertices, tuple(edges), contacts)
@@ -82,7 +84,12 @@ def reach_of(number: int, shape: Shape, side: int, pixel: float) -> Reach:
     count = round(inwards / (STEP_PX * pixel))
     ways = np.arange(-count, int(REACH_PX / STEP_PX) + 1) * STEP_PX * pixel
     points, tangents = along_end(shape, side, ways)
-    return Reach(number, side, ways, points, tangents)
+    return Reach(number, side, pixel, ways, points, tangents)
+
+
+def pixel_of(reaches: Iterable[Reach]) -> float:
+    """Size of a pixel where some ends meet."""
+    return float(np.mean([reach.pixel for reach in reaches]))
 
 
 def along_end(shape: Shape, side: int, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -99,22 +106,23 @@ def along_end(shape: Shape, side: int, ways: np.ndarray) -> tuple[np.ndarray, np
     return shape.at(parameters) + np.maximum(ways, 0.0)[:, None] * tangents, tangents
 
 
-def meetings(reaches: Sequence[Reach], pixel: float) -> list[Meeting]:
+def meetings(reaches: Sequence[Reach]) -> list[Meeting]:
     """The Meetings of pairs of ends, best first."""
     if len(reaches) < 2:
         return []
     places = np.array([reach.points[reach.ways == 0][0] for reach in reaches])
     found = []
-    for i, j in sorted(cKDTree(places).query_pairs(2 * REACH_PX * pixel)):
+    for i, j in pairs_within(places, np.array([2 * REACH_PX * reach.pixel for reach in reaches])).tolist():
         if reaches[i].edge != reaches[j].edge:
-            meeting = meet(i, j, reaches[i], reaches[j], pixel)
+            meeting = meet(i, j, reaches[i], reaches[j])
             if meeting is not None:
                 found.append(meeting)
     return sorted(found, key=lambda meeting: (meeting.cost, meeting.first, meeting.second))
 
 
-def meet(i: int, j: int, first: Reach, second: Reach, pixel: float) -> Meeting | None:
+def meet(i: int, j: int, first: Reach, second: Reach) -> Meeting | None:
     """The Meeting of two ends, or None where they come not near enough."""
+    pixel = pixel_of((first, second))
     apart = np.linalg.norm(first.points[:, None] - second.points, axis=2)
     ways = FRUGAL * (np.abs(first.ways)[:, None] + np.abs(second.ways))
     a, b = np.unravel_index(np.argmin(apart + ways), apart.shape)
@@ -130,7 +138,7 @@ def meet(i: int, j: int, first: Reach, second: Reach, pixel: float) -> Meeting |
     return Meeting(cost, i, j, (float(first.ways[a]), float(second.ways[b])), smooth)
 
 
-def grouped(reaches: Sequence[Reach], found: Iterable[Meeting], pixel: float) -> list[Group]:
+def grouped(reaches: Sequence[Reach], found: Iterable[Meeting]) -> list[Group]:
     """The ends that meet, as dicts end -> way; every end is in one of them. found: their Meetings."""
     group_of = {end: {end: 0.0} for end in range(len(reaches))}
     for meeting in found:
@@ -141,17 +149,18 @@ def grouped(reaches: Sequence[Reach], found: Iterable[Meeting], pixel: float) ->
         for end, way in zip((meeting.first, meeting.second), meeting.ways, strict=True):
             if len(group_of[end]) == 1:
                 both[end] = way
-        if len({reaches[end].edge for end in both}) < len(both) or not agree(reaches, both, pixel):
+        if len({reaches[end].edge for end in both}) < len(both) or not agree(reaches, both):
             continue
         for end in both:
             group_of[end] = both
     return list({id(group): group for group in group_of.values()}.values())
 
 
-def agree(reaches: Sequence[Reach], group: Group, pixel: float) -> bool:
+def agree(reaches: Sequence[Reach], group: Group) -> bool:
     """Is one point near enough to all the edges that are to meet in it?"""
     point = meeting_point([(reaches[end], way) for end, way in group.items()])
-    return all(np.linalg.norm(reaches[end].points - point, axis=1).min() <= MEETING_PX * pixel for end in group)
+    near = MEETING_PX * pixel_of(reaches[end] for end in group)
+    return all(np.linalg.norm(reaches[end].points - point, axis=1).min() <= near for end in group)
 
 
 def meeting_point(members: Sequence[tuple[Reach, float]]) -> np.ndarray:
@@ -171,12 +180,12 @@ def meeting_point(members: Sequence[tuple[Reach, float]]) -> np.ndarray:
 
 
 def with_contacts(
-    shapes: Sequence[Shape], reaches: Sequence[Reach], groups: Sequence[Group], vertices: np.ndarray, pixel: float
+    shapes: Sequence[Shape], reaches: Sequence[Reach], groups: Sequence[Group], vertices: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The vertices, those of free ends moved onto an edge that they touch; and (k, 2) the contacts."""
     vertices, contacts, bounds = vertices.copy(), [], bounds_of(shapes)
     for number, group in enumerate(groups):
-        own = {reaches[end].edge for end in group}
+        own, pixel = {reaches[end].edge for end in group}, pixel_of(reaches[end] for end in group)
         options = []
         places = reaches[next(iter(group))].points if len(group) == 1 else vertices[number : number + 1]
         for other in near_bounds(bounds, places, MEETING_PX * pixel).tolist():
@@ -184,7 +193,7 @@ def with_contacts(
                 continue
             shape = shapes[other]
             if len(group) == 1:
-                touch = touching(shape, reaches[next(iter(group))], pixel)
+                touch = touching(shape, reaches[next(iter(group))])
             else:
                 distance = float(distances_to(shape, vertices[number : number + 1])[0])
                 touch = (distance, vertices[number]) if distance <= MEETING_PX * pixel else None
@@ -196,11 +205,11 @@ def with_contacts(
     return vertices, np.array(contacts, dtype=np.int64).reshape(-1, 2)
 
 
-def touching(shape: Shape, reach: Reach, pixel: float) -> tuple[float, np.ndarray] | None:
+def touching(shape: Shape, reach: Reach) -> tuple[float, np.ndarray] | None:
     """(cost, point) where a free end touches a shape, or None."""
     apart = distances_to(shape, reach.points)
     at = int(np.argmin(apart + FRUGAL * np.abs(reach.ways)))
-    if apart[at] > 0.5 * MEETING_PX * pixel:
+    if apart[at] > 0.5 * MEETING_PX * reach.pixel:
         return None
     return float(apart[at] + FRUGAL * abs(reach.ways[at])), reach.points[at]
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from taichi_edges.evidence.edge_support import SPACING_PX, Support, support_of
 from taichi_edges.fitting.arcs import cross
-from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline
+from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline, middles_of
 from taichi_edges.geometry.wireframe import Wireframe
 from taichi_edges.refinement.adjustment import (
     CORRELATED_PX,
@@ -103,9 +103,9 @@ def found_relations(wireframe: Wireframe, matching: "EdgelMatching") -> tuple[Co
     """Counter of the relations found by kind, and the list of those that the others do not imply."""
     counts: Counter[str] = Counter()
     imposed = []
-    judge = Judge.of(wireframe, matching)
+    judge, pixels = Judge.of(wireframe, matching), matching.pixel_at(middles_of(wireframe.shapes))
     for kind in KINDS:
-        candidates = [(relation, judge.linear(relation)) for relation in RELATIONS[kind](wireframe, matching.pixel)]
+        candidates = [(relation, judge.linear(relation)) for relation in RELATIONS[kind](wireframe, pixels)]
         for relation, linear in sorted(candidates, key=lambda pair: judge.rise(pair[1])):
             if judge.rise(linear) <= judge.allowed:
                 counts[kind] += 1
@@ -147,10 +147,10 @@ class Judge:
     @staticmethod
     def of(wireframe: Wireframe, matching: "EdgelMatching") -> "Judge":
         """From the equations of an adjusted Wireframe."""
-        layout = Layout.of(wireframe)
-        problem = Problem(wireframe, layout, matching.pixel)
+        layout, pixels = Layout.of(wireframe), matching.pixel_at(middles_of(wireframe.shapes))
+        problem = Problem(wireframe, layout, pixels)
         image = image_equations(problem, wireframe, matching, RADIUS_PX)
-        joints = [*smooth_joints(wireframe), *contacts(wireframe, matching.pixel)]
+        joints = [*smooth_joints(wireframe), *contacts(wireframe, pixels)]
         matrix = (image.matrix() + constrained(layout, wireframe, joints).matrix()).toarray()
         told = np.diag(matrix)
         scale = 1.0 / np.sqrt(np.maximum(told, LEAST_TOLD * told.max(initial=1e-300)))
@@ -233,48 +233,49 @@ def _of_kind(wireframe: Wireframe, *kinds: str) -> list[tuple[int, np.ndarray]]:
 LINES, ROUND, FLAT = ("line",), ("arc", "circle"), ("arc", "circle", "elliptic_arc", "ellipse")
 
 
-def _parallel(wireframe: Wireframe, pixel: float) -> Iterator[Relation]:
+def _parallel(wireframe: Wireframe, pixels: np.ndarray) -> Iterator[Relation]:
     """Directions of lines, and normals of arcs."""
     for (one, a), (other, b) in combinations(_of_kind(wireframe, *LINES, *FLAT), 2):
         if np.linalg.norm(cross(a[DIRECTION], b[DIRECTION])) < np.sin(MOST_TURN):
             yield Relation("parallel", (one, other), partial(_cross, _sides(a[DIRECTION])))
 
 
-def _perpendicular(wireframe: Wireframe, pixel: float) -> Iterator[Relation]:
+def _perpendicular(wireframe: Wireframe, pixels: np.ndarray) -> Iterator[Relation]:
     """Likewise."""
     for (one, a), (other, b) in combinations(_of_kind(wireframe, *LINES, *FLAT), 2):
         if abs(a[DIRECTION] @ b[DIRECTION]) < np.sin(MOST_TURN):
             yield Relation("perpendicular", (one, other), _cosine)
 
 
-def _equal_radius(wireframe: Wireframe, pixel: float) -> Iterator[Relation]:
+def _equal_radius(wireframe: Wireframe, pixels: np.ndarray) -> Iterator[Relation]:
     """Arcs and circles."""
     for (one, a), (other, b) in combinations(_of_kind(wireframe, *ROUND), 2):
-        if abs(a[RADIUS] - b[RADIUS]) < min(MOST_OFF_PX * pixel, MOST_RATIO * a[RADIUS]):
+        if abs(a[RADIUS] - b[RADIUS]) < min(MOST_OFF_PX * pixels[[one, other]].mean(), MOST_RATIO * a[RADIUS]):
             yield Relation("equal_radius", (one, other), _radii)
 
 
-def _coaxial(wireframe: Wireframe, pixel: float) -> Iterator[Relation]:
+def _coaxial(wireframe: Wireframe, pixels: np.ndarray) -> Iterator[Relation]:
     """Arcs and circles: the centre of one on the axis of the other."""
     for (one, a), (other, b) in combinations(_of_kind(wireframe, *ROUND), 2):
         axis = a[DIRECTION]
         parallel = np.linalg.norm(cross(axis, b[DIRECTION])) < np.sin(MOST_TURN)
-        if parallel and np.linalg.norm(cross(axis, b[PLACE] - a[PLACE])) < MOST_OFF_PX * pixel:
+        if parallel and np.linalg.norm(cross(axis, b[PLACE] - a[PLACE])) < MOST_OFF_PX * pixels[[one, other]].mean():
             yield Relation("coaxial", (one, other), partial(_off_axis, _sides(axis)))
 
 
-def _coplanar(wireframe: Wireframe, pixel: float) -> Iterator[Relation]:
+def _coplanar(wireframe: Wireframe, pixels: np.ndarray) -> Iterator[Relation]:
     """Lines and arcs in the plane of an arc, or in that of two lines that share a vertex."""
-    planes: list[tuple[np.ndarray, np.ndarray]] = []
+    planes: list[tuple[np.ndarray, np.ndarray, float]] = []
     edges = dict(_of_kind(wireframe, *LINES, *FLAT))
     for members in _plane_spans(wireframe, edges):
         normal, place = _plane(*(edges[number] for number in members))
-        if any(_in_plane(normal, place, *plane, pixel) for plane in planes):
+        pixel = float(pixels[list(members)].mean())
+        if any(_in_plane(normal, place, other, where, 0.5 * (pixel + its)) for other, where, its in planes):
             continue
-        planes.append((normal, place))
+        planes.append((normal, place, pixel))
         for number, feature in edges.items():
             flat = wireframe.shapes[number].kind != "line"
-            if number not in members and _lies_in(normal, place, feature, flat, pixel):
+            if number not in members and _lies_in(normal, place, feature, flat, 0.5 * (pixel + pixels[number])):
                 sides = _sides(normal)
                 yield Relation("coplanar", (*members, number), partial(_off_plane, sides if flat else None))
 

@@ -24,7 +24,7 @@ from taichi_edges.evidence.lying import EdgelsAbout
 from taichi_edges.evidence.noise import LEAST_NOISE_PX, MOST_NOISE_PX, ON_NOISES
 from taichi_edges.evidence.verdict import marks_of, probabilities, reasons
 from taichi_edges.fitting.model_selection import Yardstick
-from taichi_edges.geometry.shapes import Shape
+from taichi_edges.geometry.shapes import Shape, middles_of
 from taichi_edges.geometry.wireframe import Wireframe
 from taichi_edges.refinement.adjustment import adjusted
 from taichi_edges.refinement.anchoring import anchored_lines
@@ -82,10 +82,11 @@ def refine_wireframe(loose: Wireframe, views: "Views", config: "RefineConfig") -
     if not config.enabled or not len(loose):
         return loose, RefineCounts()
     matching = EdgelMatching(views, config.min_views)
-    strokes = [shape for shape in loose.shapes if shape.length >= LEAST_LENGTH_PX * matching.pixel]
+    least = LEAST_LENGTH_PX * matching.pixel_at(middles_of(loose.shapes))
+    strokes = [shape for shape, length in zip(loose.shapes, least, strict=True) if shape.length >= length]
     shapes, counts = whole_edges(strokes, matching, config)
     anchored = anchored_lines(matching, shapes) if config.anchor else []
-    wireframe, lines = completed(connected([*shapes, *anchored], matching.pixel), matching)
+    wireframe, lines = completed(connected([*shapes, *anchored], matching.pixel_at), matching)
     wireframe, relations = related(adjusted(wireframe, matching), matching, config.regularise)
     judged, doubted, unsupported = with_evidence(wireframe, matching, config)
     counts = replace(
@@ -110,16 +111,17 @@ def whole_edges(
     """
     yardstick, seen = yardstick_of(shapes, matching), partial(support_along, matching)
     likely, hopeless, unseen = not_hopeless(matching, shapes, config)
-    shapes, first = continued(likely, yardstick, seen)
+    shapes, first = continued(likely, yardstick, matching.pixel_at, seen)
     kept, doubted, lost = with_support(matching, shapes, config)
-    longer, second = continued(with_longer_ends(matching, kept), yardstick, seen, WIDE_GAP_PX)
+    longer = with_longer_ends(matching, kept)
+    longer, second = continued(longer, yardstick, matching.pixel_at, seen, WIDE_GAP_PX)
     found, doubted_too, lost_too = with_support(matching, longer, config)
     counts = asdict(first + second) | {"unsupported": unseen + lost + lost_too}
     return found, RefineCounts(**counts, doubted=dict(hopeless + doubted + doubted_too))
 
 
 def yardstick_of(shapes: Sequence[Shape], matching: EdgelMatching) -> Yardstick:
-    """The Yardstick of strokes: the noise of their edgels, and by how much edges are off beyond it."""
+    """The Yardstick of strokes at the scene: the noise of their edgels, and by how much edges are off beyond it."""
     noise = np.hypot(NOISE_PX, support_of(matching, shapes).noise_px)
     return Yardstick(noise * matching.pixel, matching.pixel)
 
@@ -180,7 +182,7 @@ def likely_percent(wireframe: Wireframe) -> float:
 
 def shown_percent(matching: EdgelMatching, wireframe: Wireframe) -> float:
     """Of the edgels of all views, how many lie on the edges."""
-    samples = EdgeSamples.along(wireframe.shapes, matching.pixel)
+    samples = EdgeSamples.along(wireframe.shapes, matching.pixel_at(middles_of(wireframe.shapes)))
     noise = edgel_noise(support_of(matching, wireframe.shapes))
     about = EdgelsAbout.of(matching, samples.points, samples.directions, ON_NOISES * noise)
     shown = np.zeros(len(matching.edgels), bool)
@@ -233,11 +235,11 @@ def is_edge(
 
 def with_longer_ends(matching: EdgelMatching, shapes: Sequence[Shape]) -> list[Shape]:
     """The shapes, ends that would meet no other extended as far as the images show them."""
-    wireframe, claims = connected(shapes, matching.pixel), claims_of(matching, shapes)
+    wireframe, claims = connected(shapes, matching.pixel_at), claims_of(matching, shapes)
     degrees = wireframe.degrees
     free = [[side for side, end in enumerate(edge.vertices) if degrees[end] == 1] for edge in wireframe.edges]
 
     def seen(numbers: list[int], places: list[tuple[Shape, np.ndarray]]) -> list[np.ndarray]:
         return support_of_places(matching, places, claims, numbers)
 
-    return extended(shapes, free, seen, matching.pixel)
+    return extended(shapes, free, seen, matching.pixel_at)

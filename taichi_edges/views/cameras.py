@@ -18,6 +18,8 @@ NEAR = 0.01  # what is nearer counts as behind the camera
 SWEPT_FROM = 2 * NEAR  # a sweep's steps are even in inverse depth: half of them would lie nearer than this
 DRAWN_FROM = 5 * NEAR  # a nearer Gaussian would fill the image: it is not drawn, and its camera does not vote
 
+AT_ONCE = 4096  # points that are looked up in all views together
+
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # right-multiplies camera-to-world: flips the y and z camera axes
 
 
@@ -125,6 +127,25 @@ class Cameras:
         homogeneous = np.einsum("nij,nj->ni", matrices[:, :, :3], points) + matrices[:, :, 3]
         depths = homogeneous[:, 2]
         return homogeneous[:, :2] / np.where(depths > NEAR, depths, np.nan)[:, None], depths
+
+    def pixel_at(self, points: np.ndarray, width: int, height: int) -> np.ndarray:
+        """(n,) size of a pixel at each of (n, 3) points, in their units; NaN where no view has it in its image.
+
+        Depth / focal length, the median over the views that have the point in their image: neither a close-up nor a
+        view from afar tells how well all of them together see a place. width, height: of the images, px.
+        """
+        found = [np.zeros(0)]
+        for first in range(0, len(points), AT_ONCE):
+            seen = self.matrices[:, :, :3] @ points[first : first + AT_ONCE].T + self.matrices[:, :, 3:]  # (V, 3, n)
+            depths = np.where(seen[:, 2] > NEAR, seen[:, 2], np.nan)
+            pixels = np.moveaxis(seen[:, :2] / depths[:, None], 1, 2)
+            inside = inside_image(pixels.reshape(-1, 2), width, height).reshape(depths.shape)
+            sizes = np.sort(np.where(inside, depths / self.focal[:, None], np.inf), axis=0)
+            counts = inside.sum(axis=0)
+            middle = np.clip([(counts - 1) // 2, counts // 2], 0, len(sizes) - 1)
+            medians = np.take_along_axis(sizes, middle, axis=0).mean(axis=0)
+            found.append(np.where(counts > 0, medians, np.nan))
+        return np.concatenate(found)
 
 
 def camera_centre(world_to_camera: np.ndarray) -> np.ndarray:
