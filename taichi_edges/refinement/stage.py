@@ -82,8 +82,7 @@ def refine_wireframe(loose: Wireframe, views: "Views", config: "RefineConfig") -
     if not config.enabled or not len(loose):
         return loose, RefineCounts()
     matching = EdgelMatching(views, config.min_views)
-    strokes = [shape for shape in loose.shapes if shape.length >= LEAST_LENGTH_PX * matching.pixel]
-    shapes, counts = whole_edges(strokes, matching, config)
+    shapes, counts = whole_edges(strokes_of(loose, matching), matching, config)
     anchored = anchored_lines(matching, shapes) if config.anchor else []
     wireframe, lines = completed(connected([*shapes, *anchored], matching.pixel), matching)
     wireframe, relations = related(adjusted(wireframe, matching), matching, config.regularise)
@@ -99,6 +98,11 @@ def refine_wireframe(loose: Wireframe, views: "Views", config: "RefineConfig") -
     if config.verdict and len(judged):
         counts = replace(counts, likely_percent=likely_percent(judged), shown_percent=shown_percent(matching, judged))
     return judged, counts
+
+
+def strokes_of(loose: Wireframe, matching: EdgelMatching) -> list[Shape]:
+    """The shapes of loose edges, without those that are too short to have a direction."""
+    return [shape for shape in loose.shapes if shape.length >= LEAST_LENGTH_PX * matching.pixel]
 
 
 def whole_edges(
