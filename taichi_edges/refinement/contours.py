@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from taichi_edges.scene.settings import RefineConfig
     from taichi_edges.views.views import Views
 
-LEAST_LENGTH_PX = 8.0  # of a stroke; chance lines are shorter, and radii are told at places 4 px apart
+LEAST_LENGTH_PX = 8.0  # of a stroke: radii are told at places 4 px apart, and it shall have two
 LEAST_ON_EDGE = 0.5  # of a stroke beside edges that are kept: it is a piece of one of these
-MANY_MORE = 1.5  # times the views of a sharp edge; beside a second edge it is below 1.2, of exact contours above 1.7
-LEAST_SHARE = 0.6  # of the views with edgels about: chance lines between contours of real parts have a half at most
+MANY_MORE = 1.5  # times the views of a sharp edge: of exact contours 1.7 and more, of sharp edges 1.0
+LEAST_SHARE = 0.6  # of the views with edgels about; lines that chance puts between contours of real parts have less
 LEAST_TOLD_PX = 5.0  # radii; of fillets of 3 and 5 px on real parts a third is missing
 MOST_RANGE = 5 / 3  # greatest over least radius: known to a quarter
 
