@@ -134,15 +134,15 @@ def centre(views, view):
 
 
 class CylinderContour:
-    """The right-hand contour of an upright cylinder: a vertical line that moves with the viewpoint."""
+    """The right-hand contour of an upright cylinder, -1: left-hand: a vertical line that moves with the viewpoint."""
 
-    def __init__(self, middle, radius, low, high):
-        self.middle, self.radius, self.low, self.high = np.asarray(middle), radius, low, high
+    def __init__(self, middle, radius, low, high, side=1):
+        self.middle, self.radius, self.low, self.high, self.side = np.asarray(middle), radius, low, high, side
 
     def seen_from(self, camera):
         away = camera[:2] - self.middle
         distance, bearing = np.linalg.norm(away), np.arctan2(away[1], away[0])
-        angle = bearing + np.arccos(self.radius / distance)
+        angle = bearing + self.side * np.arccos(self.radius / distance)
         foot = self.middle + self.radius * np.array([np.cos(angle), np.sin(angle)])
         return line([*foot, self.low], [*foot, self.high])
 

@@ -14,7 +14,7 @@ from scipy.interpolate import BSpline
 from taichi_edges.exporters.dxf import APPLICATION, layer_of, write_dxf
 from taichi_edges.exporters.nurbs import joined
 from taichi_edges.exporters.step import connected_parts, encoded, prefix_for, write_step
-from taichi_edges.files.palette import KIND_COLOURS
+from taichi_edges.files.palette import CONTOUR_COLOUR, KIND_COLOURS
 from taichi_edges.geometry.bezier import evaluate_bezier
 from taichi_edges.geometry.edge_set import write_edges
 from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
@@ -192,6 +192,25 @@ def test_dxf_says_what_the_images_say(tmp_path):
     judged = {"confidence": 0.5, "residual_px": 0.21, "supported_length": 0.9, "views": 5}
     assert told[3] == {"edge": 3, "name": "line_3", **judged}
     assert told[4] == {"edge": 4, "name": "arc_4"}
+
+
+def test_dxf_has_contours_in_a_layer_of_their_own(tmp_path):
+    import ezdxf
+
+    radii = [{"radius": 0.1, "radius_px": 20.0, "radius_uncertainty_px": 1.5}, {"radius_px": 8.0}]
+    contours = [(Line(np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.9]])), radii[0]), (Spline(smooth_chain()), radii[1])]
+    without = write_dxf(tmp_path / "without.dxf", house())
+    document = ezdxf.readfile(write_dxf(tmp_path / "edges.dxf", house(), contours))
+    assert not document.audit().errors and document.layers.get("CONTOURS").rgb == CONTOUR_COLOUR
+    edges, found = (list(document.modelspace())[part] for part in (slice(len(house())), slice(len(house()), None)))
+    assert {entity.dxf.layer for entity in found} == {"CONTOURS"}
+    assert "CONTOURS" not in {entity.dxf.layer for entity in edges}
+    for number, (entity, (shape, told)) in enumerate(zip(found, contours, strict=True)):
+        np.testing.assert_allclose(*dxf_points(entity, shape), rtol=0, atol=EXACT * size_of(house()))
+        pairs = [value for _, value in entity.get_xdata(APPLICATION)]
+        assert dict(zip(pairs[::2], pairs[1::2], strict=True)) == {"contour": number, **told}
+    assert "CONTOURS" not in ezdxf.readfile(without).layers
+    assert write_dxf(tmp_path / "none.dxf", house(), []).read_bytes() == without.read_bytes()
 
 
 @pytest.mark.parametrize("write", [write_dxf, write_step])

@@ -382,6 +382,10 @@ def test_every_stage_can_say_what_it_found():
     doubted = asdict(RefineCounts(doubted={"blur": 2, "sharpness": 1}))
     left_out = "left out: 1 contour of a rounded surface, 2 rounded or blurred edges"
     assert FINDINGS["refine"]({"edges": 1, "vertices": 2, **doubted}) == f"1 edge, 2 vertices; {left_out}"
+    apart = {"edges": 1, "vertices": 2, "contours": 1, **asdict(RefineCounts(joined=2))}
+    assert (
+        FINDINGS["refine"](apart) == "1 edge, 2 vertices; 2 strokes joined to others; 1 contour in a file of their own"
+    )
     anchored = "1 edge, 2 vertices; 2 lines anchored to edges that they meet"
     assert FINDINGS["refine"]({"edges": 1, "vertices": 2, **asdict(RefineCounts(anchored=2))}) == anchored
 
@@ -439,6 +443,32 @@ def test_a_stage_whose_inputs_come_out_the_same_is_skipped(copied):
     assert said.states() == states(
         ran=("cluster",), skipped=("prepare", "train", "fit", "refine", "evaluate", "export")
     )
+
+
+def test_contours_that_are_asked_for_are_exported_and_others_are_not(copied):
+    """The edges are the same, and so is what is evaluated."""
+    _, _, folder = copied
+    judged, record_file = ["refine.enabled=true"], folder / "run.json"
+    rerun(copied, judged)
+    before = contents(folder)
+    assert "contours.json" not in before
+    record, said = rerun(copied, [*judged, "refine.contours=true"])
+    assert said.states() == states(ran=("refine", "export"), skipped=("prepare", "train", "cluster", "fit", "evaluate"))
+    assert list(record["stages"]["refine"]["outputs"]) == ["edges.json", "contours.json"]
+    assert rerun(copied, [*judged, "refine.contours=true"])[1].states() == states((), STAGES)
+
+    with (folder / "contours.json").open("a") as file:
+        file.write("\n")
+    record["stages"]["refine"]["outputs"]["contours.json"] = digest_file(folder / "contours.json")
+    record_file.write_text(json.dumps(record))  # as if refine had found others
+    _, said = rerun(copied, [*judged, "refine.contours=true"])
+    assert "export again (overlays.png: stale: contours.json has changed)" in said.lines
+
+    _, said = rerun(copied, judged)
+    assert said.states()["refine"] == said.states()["export"] == "ran"
+    after = contents(folder)
+    del before["run.json"], after["run.json"]  # which has the seconds
+    assert after == before
 
 
 def test_another_version_of_a_package_makes_those_stages_stale_that_use_it(copied, monkeypatch):

@@ -59,9 +59,10 @@ def print_summary(run: Run, record: dict[str, Any], until: str | None = None) ->
 def result_files(stages: dict[str, Any], done: Sequence[str]) -> list[str]:
     """What to open of the stages that are done: the edges as far as they have come, and what shows them."""
     edges = [name for stage, name in (("fit", "edges_fit.json"), ("refine", "edges.json")) if stage in done][-1:]
+    contours = stages["refine"]["facts"].get("files", []) if "refine" in done else []
     exported = stages["export"]["facts"]["files"] if "export" in done else []
     prepared = [name for name in stages["prepare"]["facts"]["files"] if name == "detection.png"]
-    return [name for name in (*edges, *exported, *prepared) if "/" not in name]
+    return [name for name in (*edges, *contours, *exported, *prepared) if "/" not in name]
 
 
 def _print_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -94,6 +94,7 @@ def describe_fit(facts: Mapping[str, Any]) -> str:
 def describe_refine(facts: Mapping[str, Any]) -> str:
     """'33 edges, 20 vertices; 2 strokes joined to others; 71 parallel (refine.regularise: true makes them exact)'."""
     found = f"{amount(facts['edges'], 'edge')}, {amount(facts['vertices'], 'vertex', 'vertices')}"
+    apart = f"; {amount(facts['contours'], 'contour')} in a file of their own" if "contours" in facts else ""
     done: list[tuple[int, str] | tuple[int, str, str]] = [
         (facts["joined"], "stroke joined to others", "strokes joined to others"),
         (facts["circles"], "circle completed", "circles completed"),
@@ -104,6 +105,7 @@ def describe_refine(facts: Mapping[str, Any]) -> str:
     return (
         found
         + (f"; {changed}" if changed else "")
+        + apart
         + left_out(
             (facts["duplicates"], "duplicate"),
             *((facts["doubted"][mark], *name) for mark, name in DOUBTS.items() if mark in facts["doubted"]),

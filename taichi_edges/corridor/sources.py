@@ -70,6 +70,11 @@ def picture_files(run: "Run") -> list[Path]:
     return [Path(path) for path in listed_frames(run).image_paths if path and Path(path).is_file()]
 
 
+def export_files(run: "Run") -> list[Path]:
+    """What the export shows beside the edges: the colour images, and contours where they are asked for."""
+    return [*picture_files(run), *([run.path("contours.json")] if run.config.refine.contours else [])]
+
+
 def truth_files(run: "Run") -> list[Path]:
     """Every file the ground truth consists of."""
     from taichi_edges.evaluation.ground_truth import check_truth_path

@@ -67,7 +67,7 @@ STAGES = {
         (),
         ("edges.json", "views.npz"),
         ("overlays.png",),
-        sources.picture_files,
+        sources.export_files,
         packages=("ezdxf",),
     ),
 }

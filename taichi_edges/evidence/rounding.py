@@ -6,6 +6,9 @@ radius and the direction from which the line is the contour. An edge is the case
 directions are tried, and the views counted in which an edgel lies where each says. An edge has its edgels where
 radius 0 says, and no radius finds many more; a contour has them on the line in some views, and beside it, as its radius
 says, in the others.
+
+To tell how large the radius is takes more (`radii_at`): a line that was fitted to a contour lies in front of the
+surface, by some tenths of a pixel, and from half as far a contour moves by twice as many pixels.
 """
 
 from dataclasses import dataclass
@@ -16,7 +19,7 @@ import taichi as ti
 from taichi_edges.evidence.edgel_matching import EdgelMatching, is_inside, project_line
 from taichi_edges.kernels.device import download, upload
 from taichi_edges.kernels.edgel_grid import cells_around
-from taichi_edges.kernels.points import F32_2D, F32_3D, I32_1D, blocks_of, load_camera, load_point
+from taichi_edges.kernels.points import F32_1D, F32_2D, F32_3D, I32_1D, blocks_of, load_camera, load_point
 
 AROUND_PX = 8.0  # edgels so far to the side of a place are looked at
 MOST_AROUND = 6  # of them in each view
@@ -25,18 +28,32 @@ MOST_SINE = 0.2  # of their angle with the line, 12 degrees: a contour keeps bes
 LEAST_RADIUS_PX, RADIUS_STEP, RADII = 1.5, 1.06, 64  # to 60 px; of smaller ones the contour stays within a pixel
 DIRECTIONS = 72  # from which the line is the contour, 5 degrees apart
 GROWING = 0.06  # of how far a contour has moved: radii and directions that are tried are no closer
+DEEPEST, FARTHEST = -1, 4  # a line lies so many tolerances in front of the surface: strokes of real contours do
 UNKNOWN = 1e9
 
 
 @dataclass(frozen=True)
 class Rounding:
     """Of n places. views: (n,) that have an edgel on the place. rounded: (n,) that have one where the best radius says,
-    at least `views`. radius_px: (n,) that radius; 0 where a sharp edge explains as much.
+    at least `views`. around: (n,) that have any within AROUND_PX. least_px, most_px: (n,) range of the radii that
+    explain as much; 0 where a sharp edge does.
     """
 
     views: np.ndarray
     rounded: np.ndarray
-    radius_px: np.ndarray
+    around: np.ndarray
+    least_px: np.ndarray
+    most_px: np.ndarray
+
+    @property
+    def radius_px(self) -> np.ndarray:
+        """(n,) the middle of the range."""
+        return 0.5 * (self.least_px + self.most_px)
+
+    @property
+    def uncertainty_px(self) -> np.ndarray:
+        """(n,) half of the range."""
+        return 0.5 * (self.most_px - self.least_px)
 
 
 @ti.kernel
@@ -53,12 +70,15 @@ def offsets_around(
     columns: ti.i32,
     starts: I32_1D,
     elements: F32_2D,
+    pixels: F32_1D,
     offsets: F32_3D,
     angles: F32_2D,
+    scales: F32_2D,
 ):
     """offsets (n, V, MOST_AROUND): px to the side of each place, of edgels along it; angles (n, V) of views about it.
 
     A side is the same in all views: that of direction x (camera - place). offsets: UNKNOWN where there are no more.
+    scales (n, V): px in the view for a pixel of the place, of size pixels (n,), to that side.
     """
     for block in range(blocks):
         for view in range(cameras.shape[0]):
@@ -75,7 +95,8 @@ def offsets_around(
                 towards = ti.Vector([centres[view, a] for a in ti.static(range(3))]) - place
                 angles[i, view] = ti.atan2(towards.dot(second), towards.dot(first))
                 if front and is_inside(pixel_at, height, width):
-                    side = slopes @ direction.cross(towards)
+                    side = slopes @ (direction.cross(towards).normalized() * pixels[i])
+                    scales[i, view] = side.norm()
                     across = ti.Vector([-along[1], along[0]])
                     if across.dot(side) < 0:
                         across = -across
@@ -125,6 +146,31 @@ def try_radii(offsets: F32_3D, angles: F32_2D, tight: ti.f32, moves: F32_2D, bes
         best[i, 0], best[i, 1], best[i, 2] = sharp, most, winner
 
 
+@ti.kernel
+def count_views(offsets: F32_3D, angles: F32_2D, tight: ti.f32, cosines: F32_2D, explained: F32_2D):
+    """explained (n, 1 + RADII): the most views that a sharp edge nearby, radius 0, and each radius explain.
+
+    The contour is s r - (r + f) cos t to the side: s tells its two sides, f is by how much the place lies in front of
+    the surface. offsets: in pixels of the place. cosines: (n, V) scratch.
+    """
+    for i in range(offsets.shape[0]):
+        for turn in range(DIRECTIONS):
+            for view in range(offsets.shape[1]):
+                cosines[i, view] = ti.cos(angles[i, view] - turn * (2.0 * np.pi / DIRECTIONS))
+            for front in range(DEEPEST, FARTHEST + 1):
+                radius = 0.0
+                for number in range(1 + RADII):
+                    inwards, outwards = 0, 0
+                    for view in range(offsets.shape[1]):
+                        cosine = cosines[i, view]
+                        moved = radius * ((1.0 if cosine > 0 else -1.0) - cosine) - front * tight * cosine
+                        if offsets[i, view, 0] < UNKNOWN and ti.abs(moved) < 2.0 * AROUND_PX:
+                            outwards += 1 if is_there(offsets, i, view, moved, tight) else 0
+                            inwards += 1 if is_there(offsets, i, view, -moved, tight) else 0
+                    explained[i, number] = ti.max(explained[i, number], inwards, outwards)
+                    radius = ti.max(radius * RADIUS_STEP, LEAST_RADIUS_PX)
+
+
 @ti.func
 def is_there(offsets: ti.template(), i, view, moved, tight):
     """Whether a view has an edgel where the contour would have moved to."""
@@ -136,20 +182,53 @@ def is_there(offsets: ti.template(), i, view, moved, tight):
 
 
 def rounding_at(matching: EdgelMatching, points: np.ndarray, directions: np.ndarray, tight_px: float) -> Rounding:
-    """Rounding at (n, 3) points with (n, 3) unit directions. tight_px: within so much an edgel is where a law says."""
+    """Rounding at (n, 3) points with (n, 3) unit directions. tight_px: within so much an edgel is where a law says.
+
+    The range holds the first of the radii that explain most, no other; `radii_at` tells it better.
+    """
+    offsets, angles, _ = _around(matching, points, directions)
+    best = upload(np.zeros((len(points), 3), np.float32))
+    if len(points):
+        try_radii(upload(offsets), upload(angles), tight_px, upload(np.zeros_like(angles)), best)
+    sharp, rounded, radius = download(best).T.astype(np.float64)
+    return Rounding(sharp, rounded, _around_at_all(offsets), np.abs(radius), np.abs(radius))
+
+
+def radii_at(matching: EdgelMatching, points: np.ndarray, directions: np.ndarray, tight_px: float) -> Rounding:
+    """`rounding_at` places that may lie in front of the surface, or aside of the sharp edge; six times as slow.
+
+    The range holds all radii that explain as many views as the best one less one, and half a step more at either end;
+    infinite where the greatest that is tried does.
+    """
+    offsets, angles, scales = _around(matching, points, directions)
+    explained = upload(np.zeros((len(points), 1 + RADII), np.float32))
+    if len(points):
+        scaled = np.where(offsets < UNKNOWN, offsets / np.where(scales > 0, scales, 1.0)[..., None], offsets)
+        count_views(upload(scaled), upload(angles), tight_px, upload(np.zeros_like(angles)), explained)
+    counts = download(explained).astype(np.float64)
+    enough, radii = counts >= counts.max(axis=1, keepdims=True) - 1, LEAST_RADIUS_PX * RADIUS_STEP ** np.arange(RADII)
+    least = np.where(enough[:, 0], 0.0, radii[enough[:, 1:].argmax(axis=1)] * RADIUS_STEP**-0.5)
+    most = np.append(radii[:-1] * RADIUS_STEP**0.5, np.inf)[::-1][enough[:, :0:-1].argmax(axis=1)]
+    return Rounding(counts[:, 0], counts.max(axis=1), _around_at_all(offsets), least, np.where(enough[:, 0], 0.0, most))
+
+
+def _around_at_all(offsets: np.ndarray) -> np.ndarray:
+    """(n,) views in which any edgel is so near to the place that it is looked at."""
+    return (offsets[..., 0] < UNKNOWN).sum(axis=1).astype(np.float64)
+
+
+def _around(
+    matching: EdgelMatching, points: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The offsets, angles and scales of `offsets_around`."""
     count, views = len(points), matching.edgels.view_count
     offsets = upload(np.full((count, views, MOST_AROUND), UNKNOWN, np.float32))
-    angles = upload(np.zeros((count, views), np.float32))
+    angles, scales = (upload(np.zeros((count, views), np.float32)) for _ in range(2))
     places, ways = (upload(np.ascontiguousarray(array, np.float32)) for array in (points, directions))
     grid = (matching.grid.rows, matching.grid.columns, matching.grid.starts, matching.grid.elements)
     if count:
         centres = upload(matching.every_camera.centres.astype(np.float32))
-        scene = (matching.cameras, centres, *matching.size, *grid)
-        offsets_around(*blocks_of(places), places, ways, *scene, offsets, angles)
-    offsets, angles = download(offsets), download(angles)
-    best = upload(np.zeros((count, 3), np.float32))
-    if count:
-        moves = upload(np.zeros((count, views), np.float32))
-        try_radii(upload(offsets), upload(angles), tight_px, moves, best)
-    sharp, best, radius = download(best).T.astype(np.float64)
-    return Rounding(sharp, best, np.abs(radius))
+        pixels = upload(matching.pixel_at(points).astype(np.float32))
+        scene = (matching.cameras, centres, *matching.size, *grid, pixels)
+        offsets_around(*blocks_of(places), places, ways, *scene, offsets, angles, scales)
+    return download(offsets), download(angles), download(scales)

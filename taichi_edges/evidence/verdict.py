@@ -109,14 +109,22 @@ def marks_along(matching: EdgelMatching, samples: EdgeSamples, noise_px: float) 
 
 
 def _sharpness(matching: EdgelMatching, samples: EdgeSamples, tight_px: float) -> np.ndarray:
-    """(E,) see `marks_of`, at places in the middles of equal parts of each edge."""
+    """(E,) see `marks_of`, at the middles of parts of each edge."""
+    chosen, edge = middles(samples)
+    found = rounding_at(matching, samples.points[chosen], samples.directions[chosen], tight_px)
+    count = len(samples.starts) - 1
+    sharp, rounded = (np.bincount(edge, views, count) for views in (found.views, found.rounded))
+    return sharp / np.maximum(rounded + PRIOR * np.bincount(edge, minlength=count), 1.0)
+
+
+def middles(samples: EdgeSamples) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) indices of those of the EdgeSamples, SPACING_PX apart, at which radii are tried: in the middles of equal
+    parts of each edge. And (n,) the edges that they are on.
+    """
     lengths = np.diff(samples.starts)
     counts = np.clip((lengths * SPACING_PX / PLACE_PX).astype(int), 1, PLACES)
     edge, place = ragged(np.where(lengths > 0, counts, 0))
-    chosen = samples.starts[edge] + ((place + 0.5) * lengths[edge] / counts[edge]).astype(int)
-    found = rounding_at(matching, samples.points[chosen], samples.directions[chosen], tight_px)
-    sharp, rounded = (np.bincount(edge, views, len(lengths)) for views in (found.views, found.rounded))
-    return sharp / np.maximum(rounded + PRIOR * counts, 1.0)
+    return samples.starts[edge] + ((place + 0.5) * lengths[edge] / counts[edge]).astype(int), edge
 
 
 def _owners(matching: EdgelMatching, samples: EdgeSamples, about: EdgelsAbout, on_px: float) -> np.ndarray:

@@ -1,11 +1,12 @@
 """DXF for CAD programs: every edge as the entity that it is, arcs as arcs and splines as splines, in 3D.
 
-A layer for each kind. What the images say about an edge is extended data of the application TAICHI_EDGES: pairs of a
-name and a value. Numbers are those of the input's frame, which has no unit, and nor has the file.
+A layer for each kind, and one for contours. What the images say about an edge, or of the round behind a contour, is
+extended data of the application TAICHI_EDGES: pairs of a name and a value. Numbers are those of the input's frame,
+which has no unit, and nor has the file.
 """
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -15,7 +16,7 @@ import numpy as np
 from taichi_edges.exporters.naming import edge_name, refuse_empty
 from taichi_edges.exporters.nurbs import DEGREE, joined
 from taichi_edges.files.artefacts import replacing
-from taichi_edges.files.palette import KIND_COLOURS
+from taichi_edges.files.palette import CONTOUR_COLOUR, KIND_COLOURS
 
 if TYPE_CHECKING:
     from ezdxf.document import Drawing
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from ezdxf.layouts import Modelspace
     from ezdxf.math import Vec3
 
-    from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
+    from taichi_edges.geometry.shapes import EllipticArc, Line, Shape, Spline
     from taichi_edges.geometry.wireframe import Edge, Wireframe
 
 VERSION = "R2010"  # the oldest that all programs of today read with true colours
@@ -32,8 +33,13 @@ TEXT, REAL, INTEGER = 1000, 1040, 1071  # group codes of extended data
 VIEW_HEIGHT = 1.2  # of the longest side of the edges' box: what is in sight when the file is opened
 
 
-def write_dxf(path: Path | str, wireframe: "Wireframe") -> Path:
-    """Write the edges of a Wireframe, in the frame the file shall have, as a DXF."""
+def write_dxf(
+    path: Path | str, wireframe: "Wireframe", contours: "Sequence[tuple[Shape, Mapping[str, float]]]" = ()
+) -> Path:
+    """Write the edges of a Wireframe, in the frame the file shall have, as a DXF.
+
+    contours: shapes in the same frame, and {name: value} of each.
+    """
     refuse_empty(path, wireframe)
     with _fixed_dates() as ezdxf, replacing(path) as unfinished:
         document = ezdxf.new(VERSION, units=0)
@@ -41,9 +47,11 @@ def write_dxf(path: Path | str, wireframe: "Wireframe") -> Path:
         for kind in sorted({shape.kind for shape in wireframe.shapes}):
             document.layers.add(layer_of(kind), true_color=ezdxf.rgb2int(KIND_COLOURS[kind]))
         for number, edge in enumerate(wireframe.edges):
-            entity = ENTITIES[edge.shape.kind](document.modelspace(), edge.shape)
-            entity.dxf.layer = layer_of(edge.shape.kind)
-            entity.set_xdata(APPLICATION, _extended_data(number, edge))
+            _add(document, edge.shape, edge.shape.kind, _extended_data(number, edge))
+        if contours:
+            document.layers.add(layer_of("contour"), true_color=ezdxf.rgb2int(CONTOUR_COLOUR))
+        for number, (shape, told) in enumerate(contours):
+            _add(document, shape, "contour", [(TEXT, "contour"), (INTEGER, number), *_reals(told)])
         _look_at(document, wireframe)
         _declare_classes(document)
         document.saveas(unfinished)
@@ -53,6 +61,13 @@ def write_dxf(path: Path | str, wireframe: "Wireframe") -> Path:
 def layer_of(kind: str) -> str:
     """'ELLIPTIC_ARCS'."""
     return f"{kind.upper()}S"
+
+
+def _add(document: "Drawing", shape: "Shape", kind: str, data: list[tuple[int, str | float]]) -> None:
+    """A shape as an entity in the layer of a kind."""
+    entity = ENTITIES[shape.kind](document.modelspace(), shape)
+    entity.dxf.layer = layer_of(kind)
+    entity.set_xdata(APPLICATION, data)
 
 
 @contextlib.contextmanager
@@ -83,10 +98,15 @@ def _extended_data(number: int, edge: "Edge") -> list[tuple[int, str | float]]:
         (TEXT, edge_name(number, edge)),
     ]
     if edge.evidence:
-        for name in ("confidence", "residual_px", "supported_length"):
-            pairs += [(TEXT, name), (REAL, float(getattr(edge.evidence, name)))]
+        names = ("confidence", "residual_px", "supported_length")
+        pairs += _reals({name: getattr(edge.evidence, name) for name in names})
         pairs += [(TEXT, "views"), (INTEGER, int(edge.evidence.views))]
     return pairs
+
+
+def _reals(values: "Mapping[str, float]") -> list[tuple[int, str | float]]:
+    """(group code, value) pairs: each name and its number."""
+    return [pair for name, value in values.items() for pair in ((TEXT, name), (REAL, float(value)))]
 
 
 def _look_at(document: "Drawing", wireframe: "Wireframe") -> None:

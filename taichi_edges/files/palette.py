@@ -12,6 +12,7 @@ KIND_COLOURS = {
     "ellipse": (204, 121, 167), "spline": (230, 159, 0),
 }  # fmt: skip
 
+CONTOUR_COLOUR = (127, 127, 127)  # beside the kinds of edges, as contours are none
 UNLABELLED_COLOUR = (150, 150, 150)  # what belongs to no cluster
 
 # Sasha Trubetskoy's list of distinct colours, without the grey, the near-whites and black; neighbours differ most.

@@ -82,9 +82,7 @@ def refine_wireframe(loose: Wireframe, views: "Views", config: "RefineConfig") -
     if not config.enabled or not len(loose):
         return loose, RefineCounts()
     matching = EdgelMatching(views, config.min_views)
-    least = LEAST_LENGTH_PX * matching.pixel_at(middles_of(loose.shapes))
-    strokes = [shape for shape, length in zip(loose.shapes, least, strict=True) if shape.length >= length]
-    shapes, counts = whole_edges(strokes, matching, config)
+    shapes, counts = whole_edges(strokes_of(loose, matching), matching, config)
     anchored = anchored_lines(matching, shapes) if config.anchor else []
     wireframe, lines = completed(connected([*shapes, *anchored], matching.pixel_at), matching)
     wireframe, relations = related(adjusted(wireframe, matching), matching, config.regularise)
@@ -100,6 +98,12 @@ def refine_wireframe(loose: Wireframe, views: "Views", config: "RefineConfig") -
     if config.verdict and len(judged):
         counts = replace(counts, likely_percent=likely_percent(judged), shown_percent=shown_percent(matching, judged))
     return judged, counts
+
+
+def strokes_of(loose: Wireframe, matching: EdgelMatching) -> list[Shape]:
+    """The shapes of loose edges, without those that are too short to have a direction."""
+    least = LEAST_LENGTH_PX * matching.pixel_at(middles_of(loose.shapes))
+    return [shape for shape, length in zip(loose.shapes, least, strict=True) if shape.length >= length]
 
 
 def whole_edges(

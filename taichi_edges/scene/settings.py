@@ -255,6 +255,9 @@ class RefineConfig(Section):
         True, description="confidence is a probability, from all that the edgels say, fitted to parts without texture"
     )
     min_confidence: Share = Field(0.5, description="verdict: of an edge that is kept")
+    contours: bool = Field(
+        False, description="verdict: write contours of rounded surfaces, which are no edges, to a file of their own"
+    )
     anchor: bool = Field(
         False, description="anchor straight edges whose depth the views cannot tell to known edges that they meet"
     )
