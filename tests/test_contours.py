@@ -5,14 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from edgel_scenes import CylinderContour, arc, centre, line, pixel_of, views_of
+from edgel_scenes import CylinderContour, arc, centre, line, views_of
 from told import Told
 
 from taichi_edges.corridor.findings import FINDINGS
 from taichi_edges.corridor.pipeline import Run
 from taichi_edges.corridor.refine import refine
+from taichi_edges.evidence.edgel_matching import EdgelMatching
 from taichi_edges.fitting.distances import distances_to
-from taichi_edges.geometry.shapes import EllipticArc, Line
+from taichi_edges.geometry.shapes import EllipticArc, Line, middles_of
 from taichi_edges.geometry.wireframe import Wireframe, read_wireframe, wireframe_and_about, write_wireframe
 from taichi_edges.refinement.contours import found_contours
 from taichi_edges.scene.scene_file import check_scene
@@ -40,7 +41,7 @@ def cylinder_scene(generator, radius_px):
 @pytest.mark.parametrize("radius_px", [8, 20])
 def test_a_cylinder_has_contours_of_its_radius_and_edges_are_none(taichi, generator, radius_px):
     views, loose = cylinder_scene(generator, radius_px)
-    shapes, rounding = found_contours(loose, Wireframe.loose([*LINES, RIM]), views, RefineConfig())
+    shapes, rounding, _ = found_contours(loose, Wireframe.loose([*LINES, RIM]), views, RefineConfig())
     assert len(shapes) == 2 * len(SEEN_FROM)  # the pieces are joined
     for shape in shapes:
         assert shape.length > 0.9 * (HIGH - LOW) and abs(shape.tangents(0.5)[2]) > 0.999
@@ -53,7 +54,7 @@ def test_a_cylinder_has_contours_of_its_radius_and_edges_are_none(taichi, genera
 def test_what_lies_on_an_edge_that_is_kept_is_no_contour(taichi, generator):
     views, loose = cylinder_scene(generator, 8)
     kept = loose.shapes[3:5]  # both pieces of one contour
-    shapes, _ = found_contours(loose, Wireframe.loose(kept), views, RefineConfig())
+    shapes, *_ = found_contours(loose, Wireframe.loose(kept), views, RefineConfig())
     assert len(shapes) == 2 * len(SEEN_FROM) - 1
     assert min(distances_to(shape, kept[0].points).max() for shape in shapes) > 2 * PIXEL
 
@@ -61,7 +62,7 @@ def test_what_lies_on_an_edge_that_is_kept_is_no_contour(taichi, generator):
 @pytest.mark.parametrize("radius_px", [2, 100])
 def test_a_radius_that_cannot_be_told_is_not(taichi, generator, radius_px):
     views, loose = cylinder_scene(generator, radius_px)
-    shapes, rounding = found_contours(loose, Wireframe.loose(LINES), views, RefineConfig())
+    shapes, rounding, _ = found_contours(loose, Wireframe.loose(LINES), views, RefineConfig())
     assert shapes == [] and rounding.radius_px.shape == (0,)
 
 
@@ -90,7 +91,10 @@ def test_stage_writes_contours_where_it_is_asked_to_and_removes_older_ones(taich
     assert about["kind"] == "contour" and about["frame"] == "input" and set(contours.degrees.tolist()) == {1}
     lists = [about[name] for name in ("radius", "radius_px", "radius_uncertainty_px")]
     assert [len(values) for values in lists] == [len(contours)] * 3
-    np.testing.assert_allclose(about["radius"], np.array(about["radius_px"]) * pixel_of(views) / 0.01, rtol=1e-12)
+    pixels = EdgelMatching(views).pixel_at(
+        middles_of([s.transformed(views.similarity.to_unit) for s in contours.shapes])
+    )
+    np.testing.assert_allclose(about["radius"], np.array(about["radius_px"]) * pixels / 0.01, rtol=1e-6)
     for shape in contours.shapes:
         away = np.linalg.norm(views.similarity.to_unit(shape.ends)[:, :2] - MIDDLE, axis=1)
         np.testing.assert_allclose(away, 8 * PIXEL, atol=0.5 * PIXEL)
