@@ -43,12 +43,16 @@ MARGIN = 2  # px at the image's border where no edgel is looked for: as far as a
 MIN_STEP = 1.4
 CLUTTER_SIGMA = 2.0  # px; directions are compared over so much, which is short against the curves of most edges
 CLUTTER_WINDOW = 40.0  # px; the clutter's mean is taken over so much, wide against a group of slots or letters
+# px, of what the rounding of smooth shading varies, which a flat background beside it shall not hide; and how much that
+# is at most, in units of the least clutter.
+ROUNDING_WINDOW, MOST_ROUNDING = 12.0, 2.0
 BESIDE = 3.0  # blurs of the edge; there its own gradient is nearly gone (1 %)
 
 LOW = 1.6  # times the clutter; less is no candidate
 NEEDED = 2.5  # ratio of a maximum that speaks neither for nor against an edge; noise has maxima of 1.5 to 2.5
 MOST = 3.0  # votes of one maximum at most, for or against: reached at 20 times the ratio needed
-ENOUGH = 15.0  # votes for an edge: 5 maxima of 6 times the ratio needed, or 37 of 1.5 times that
+ENOUGH = 15.0  # votes for an edge: 5 maxima of 8 times the ratio needed, or 37 of 1.5 times that
+CLEAR = 1.5  # votes of a maximum that counts by its square; steps of rounding in smooth shading hardly reach it
 WINDOW = 5  # maxima to each side that are asked whether the edge goes on here
 STRAIGHT = 0.9  # mean of the unit normals over the window; a circle with a radius of 7 px has it
 WINDING = 5.0  # votes lost when the mean of the normals falls by 1
@@ -246,8 +250,10 @@ def _clutter(field: Field) -> np.ndarray:
     xx, yy, xy = (_smooth(cv2.resize(a, half, interpolation=cv2.INTER_AREA), sigma) for a in (gx**2, gy**2, gx * gy))
     smaller = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
     floor = MIN_STEP / (np.sqrt(2 * np.pi) * field.blur * NEEDED)  # the steepest gradient of a step of MIN_STEP
-    logs = _smooth(0.5 * np.log(np.maximum(smaller, 0) + floor**2), CLUTTER_WINDOW / 2)
-    return cv2.resize(np.exp(logs), (width, height), interpolation=cv2.INTER_LINEAR)
+    logs = 0.5 * np.log(np.maximum(smaller, 0) + floor**2)
+    near, wide = (np.exp(_smooth(logs, window / 2)) for window in (ROUNDING_WINDOW, CLUTTER_WINDOW))
+    clutter = np.maximum(wide, np.minimum(near, MOST_ROUNDING * floor))
+    return cv2.resize(clutter, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
 def _maxima(field: Field, clutter: np.ndarray) -> Maxima:
@@ -347,7 +353,9 @@ def _chained(maxima: Maxima, shape: tuple[int, ...], blur: float) -> tuple[Maxim
     goes_on = mean(votes) > 0
     chain_starts = np.concatenate([[False], low[1:] > high[:-1] - 1])
     runs = np.cumsum(chain_starts | np.concatenate([[False], goes_on[1:] != goes_on[:-1]]))
-    sums = np.bincount(runs, votes * np.maximum(votes, 1.0))  # few clear ones say more than many that noise may be
+    sums = np.bincount(
+        runs, votes * np.maximum(votes / CLEAR, 1.0)
+    )  # few clear ones say more than many that noise may be
     kept = goes_on & (sums[runs] >= ENOUGH)
     curvatures = _curvatures(maxima, low, high - 1)
     bent = (blur * curvatures).clip(-MOST_BENT, MOST_BENT)
