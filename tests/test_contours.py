@@ -83,7 +83,9 @@ def test_stage_writes_contours_where_it_is_asked_to_and_removes_older_ones(taich
     assert "files" not in plain and "contours in a file" not in FINDINGS["refine"](plain)
     assert not (tmp_path / "contours.json").exists()
 
-    facts = refine(run_of(tmp_path, views, loose, contours=True))
+    asked = run_of(tmp_path, views, loose, contours=True)
+    facts = refine(asked)
+    assert not any("refine.contours" in text for text in asked.progress.warnings)
     assert facts["files"] == ["contours.json"] and facts["contours"] == 2 * len(SEEN_FROM)
     assert "; 6 contours in a file of their own" in FINDINGS["refine"](facts)
     assert (tmp_path / "edges.json").read_bytes() == edges
@@ -106,7 +108,9 @@ def test_stage_writes_contours_where_it_is_asked_to_and_removes_older_ones(taich
 @pytest.mark.parametrize("settings", [{"verdict": False}, {"enabled": False}])
 def test_without_a_verdict_there_are_no_contours(taichi, generator, tmp_path, settings):
     views, loose = cylinder_scene(generator, 8)
-    facts = refine(run_of(tmp_path, views, Wireframe.loose(loose.shapes[:1]), contours=True, **settings))
+    run = run_of(tmp_path, views, Wireframe.loose(loose.shapes[:1]), contours=True, **settings)
+    facts = refine(run)
+    assert any("refine.contours" in text and "refine.verdict" in text for text in run.progress.warnings)
     assert "contours" not in facts and not (tmp_path / "contours.json").exists()
 
 

@@ -40,7 +40,11 @@ def refine(run: "Run") -> dict[str, Any]:
         run.progress.warn(doubt)
     path = run.path("contours.json")
     path.unlink(missing_ok=True)  # an older run's contours must not pass for this one's
-    if config.contours and config.verdict and config.enabled and len(loose):
+    if config.contours and not (config.verdict and config.enabled):
+        run.progress.warn(
+            "refine.contours: no contours are told without refine.enabled and refine.verdict: set both true"
+        )
+    elif config.contours and len(loose):
         facts |= {"contours": _write_contours(path, config, loose, wireframe, views, about), "files": [path.name]}
     return facts
 
