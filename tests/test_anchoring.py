@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from edgel_scenes import SIZE, blank_views, edgel_errors, either_errors, line, pixel_of, views_of
 
+from taichi_edges.detectors.straight_runs import LEAST_LENGTH_PX, runs_of, straight_runs
 from taichi_edges.evidence.edgel_matching import EdgelMatching
 from taichi_edges.geometry.shapes import Line
 from taichi_edges.geometry.wireframe import Wireframe
 from taichi_edges.refinement.anchoring import anchored_lines
 from taichi_edges.refinement.stage import refine_wireframe
-from taichi_edges.refinement.straight_runs import LEAST_LENGTH_PX, runs_of, straight_runs
 from taichi_edges.scene.settings import RefineConfig
 from taichi_edges.views.edgels import Edgels
 

@@ -467,7 +467,7 @@ def test_a_scale_on_the_command_line_replaces_that_of_the_scene(scene):
 def test_photographs_are_taken_for_what_their_reader_reads(scene, reader, expected):
     source = f"source: {{reader: {reader}, path: there}}\n"
     config = load_scene(scene(source, base=""))
-    assert config.scale == expected and config.train.seeds == "sweep" and config.source.min_chain > 0
+    assert config.scale == expected and config.train.seeds == "pair" and config.source.min_chain > 0
     part = load_scene(scene(f"{source}scale: part", base=""))
     assert part.scale == "part" and part.train.seeds == "lift" and part.source.min_chain == 0
     assert load_scene(scene(source, base=""), scale="room").refine.anchor

@@ -61,8 +61,9 @@ def _of_strokes(
 
     means = views.similarity.to_unit(gaussians.means.astype(np.float64))
     matching = EdgelMatching(views, run.config.filter.min_views)
+    directions, least = gaussians.directions(), run.config.filter.min_opacity
     trusted, strokes, noise, counts = points_on_strokes(
-        matching, means, gaussians.directions(), gaussians.opacities, strokes, run.config.filter.min_opacity
+        matching, means, directions, gaussians.opacities, strokes, least, run.config.train.enabled
     )
     yardstick = Yardstick(float(np.hypot(BIAS_PX, PLACE_NOISES * noise)) * matching.pixel, matching.pixel)
     clusters = assemble_strokes(trusted.points, trusted.directions, strokes, yardstick)

@@ -61,6 +61,8 @@ def describe_calibration(facts: Mapping[str, Any] | None) -> str:
 
 def describe_train(facts: Mapping[str, Any]) -> str:
     """'875 Gaussians after 720 view steps, final loss 0.1398'."""
+    if not facts["view_steps"]:
+        return f"{amount(facts['gaussians'], 'Gaussian')}, left where they start"
     loss = "" if facts["final_loss"] is None else f", final loss {facts['final_loss']:.4f}"
     return f"{amount(facts['gaussians'], 'Gaussian')} after {amount(facts['view_steps'], 'view step')}{loss}"
 

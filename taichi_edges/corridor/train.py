@@ -17,27 +17,30 @@ def train(run: "Run") -> dict[str, Any]:
     """`views.npz` -> `gaussians.ply` (input frame) and `train_log.csv`."""
     from taichi_edges.files.splats import write_gaussians
     from taichi_edges.kernels.device import kernel_cache, start_taichi
-    from taichi_edges.splatting.training import Training
+    from taichi_edges.splatting.training import LogRecord, Training
 
     config, views = run.config.train, read_views(run.path("views.npz"))
     generator = np.random.default_rng(run.config.seed)
     start_taichi(run.arch, run.threads, run.config.seed, kernel_cache())
     start, strokes = start_of_training(run, views, generator)
-    training = Training(views, config, generator, run.threads, run.arch)
-    gaussians, records = training.run(start, run.progress)
+    gaussians, records = start, list[LogRecord]()
+    if config.enabled:
+        gaussians, records = Training(views, config, generator, run.threads, run.arch).run(start, run.progress)
     rows = [(r.step, f"{r.seconds:.3f}", f"{r.loss:.6f}", r.gaussians) for r in records]
     write_csv(run.path("train_log.csv"), [("step", "seconds", "loss", "gaussians"), *rows])
     similarity = views.similarity
+    in_order = not (config.enabled and config.density.changes_number)  # who is left, or a copy, has no place in it
     write_gaussians(
         run.path("gaussians.ply"),
         similarity.to_input(gaussians.means.astype(np.float64)),
         gaussians.log_scales - np.float32(np.log(similarity.scale)),
         gaussians.quaternions,
         gaussians.opacity_logits,
-        None if config.density.changes_number else strokes,  # who is left, or a copy, has no place in their order
+        strokes if in_order else None,
     )
-    loss = records[-1].loss if np.isfinite(records[-1].loss) else None  # no step may have measured it alone
-    return {"gaussians": len(gaussians), "view_steps": records[-1].step, "final_loss": loss}
+    last = records[-1] if records else LogRecord(0, 0.0, np.nan, len(gaussians))
+    loss = last.loss if np.isfinite(last.loss) else None  # no step may have measured it alone
+    return {"gaussians": len(gaussians), "view_steps": last.step, "final_loss": loss}
 
 
 def start_of_training(
@@ -50,12 +53,8 @@ def start_of_training(
 
     config = run.config.train
     seeds: str = config.seeds
-    if seeds in ("lift", "sweep"):
-        found, strokes = None, None
-        if seeds == "sweep":
-            found, seeds = _swept(run, views)
-        if seeds == "lift":
-            found, strokes = _lifted(run, views)
+    if seeds in ("lift", "pair"):
+        found, strokes = _proposed(run, views)
         if found is not None:
             return found, strokes
         seeds = "points" if run.path("seeds.ply").is_file() else "random"
@@ -73,28 +72,16 @@ def start_of_training(
     return start_gaussians(points, generator, config.initial_scale, config.initial_opacity), None
 
 
-def _lifted(run: "Run", views: Views) -> "tuple[Gaussians | None, np.ndarray | None]":
+def _proposed(run: "Run", views: Views) -> "tuple[Gaussians | None, np.ndarray | None]":
     """Gaussians laid along the strokes that explain the edgels, and their strokes; None where they are too few."""
     from taichi_edges.evidence.edgel_matching import EdgelMatching
-    from taichi_edges.seeding.proposals import propose
+    from taichi_edges.seeding.proposals import propose, propose_straight
     from taichi_edges.seeding.starts import LEAST_SEEDS, stroke_gaussians
 
     config = run.config.train
     matching = EdgelMatching(views, run.config.filter.min_views)
-    with run.progress.track("lift", len(views)) as report:
-        strokes = propose(views, matching, report)
+    with run.progress.track(config.seeds, len(views)) as report:
+        strokes = (propose if config.seeds == "lift" else propose_straight)(views, matching, report)
     if len(strokes) < min(LEAST_SEEDS, config.gaussians):
         return None, None
     return stroke_gaussians(strokes, matching.pixel, config.gaussians, config.initial_opacity)
-
-
-def _swept(run: "Run", views: Views) -> "tuple[Gaussians | None, str]":
-    """Gaussians by sweeping, None where views agree in too few places; and the seeds to use: 'lift' if none can be."""
-    from taichi_edges.seeding.sweeping import TOGETHER, can_sweep, swept_gaussians
-
-    found = swept_gaussians(views, run.config.train.gaussians, run.config.train.initial_opacity, run.progress)
-    if found is not None or can_sweep(views):
-        return found, "sweep"
-    problem = f"fewer than {TOGETHER + 1} views see the same, and the sweep needs so many"
-    run.progress.warn(f"{problem}: take more pictures, each from near the one before; the edgels are lifted instead")
-    return None, "lift"

@@ -83,22 +83,27 @@ def points_on_strokes(
     opacities: np.ndarray,
     strokes: np.ndarray,
     min_opacity: float,
+    trained: bool,
 ) -> tuple[TrustedPoints, np.ndarray, float, FilterCounts]:
     """The centres along strokes that are opaque and on an edge, moved to where its viewing planes meet.
 
-    points, directions: (n, 3) unit cube, unit vectors. opacities: (n,). strokes: (n,) int. Returns TrustedPoints, the
+    points, directions: (n, 3) unit cube, unit vectors. opacities: (n,). strokes: (n,) int. trained: has training moved
+    them? If not they stay: they are where all edgels of their stroke together have put them. Returns TrustedPoints, the
     (k,) stroke of each, the noise of the edgels, px, and FilterCounts. Without their neighbours on the stroke, points
     of a gap are no edge: what goes is what fewer views see than `matching.least_views`.
     """
     opaque = np.asarray(opacities) >= min_opacity
-    points, directions, strokes = points[opaque], directions[opaque], strokes[opaque]
+    points, directions = (np.asarray(array, dtype=np.float64)[opaque] for array in (points, directions))
+    strokes, placed = strokes[opaque], TrustedPoints(points, directions)
     noise = noise_of(matching, refine_points(matching, points, directions))
-    radii = tuple(factor * noise for factor in RADII_NOISES)
-    placed = refine_points(matching, points, directions, radii, SCALE_NOISES * noise)
+    if trained:
+        radii = tuple(factor * noise for factor in RADII_NOISES)
+        moved = refine_points(matching, points, directions, radii, SCALE_NOISES * noise)
+        placed = TrustedPoints(moved.points, moved.directions)
     about = EdgelsAbout.of(matching, placed.points, placed.directions, ON_NOISES * noise)
     seen = about.closeness(ON_NOISES * noise).sum(axis=1) >= matching.least_views
     counts = FilterCounts(len(opaque), int((~opaque).sum()), int((~seen).sum()))
-    return TrustedPoints(placed.points[seen], placed.directions[seen]), strokes[seen], noise, counts
+    return placed.keep(seen), strokes[seen], noise, counts
 
 
 def _on_edge_pixels(points: np.ndarray, views: "Views", least: float, edge_threshold: float) -> np.ndarray:

@@ -48,6 +48,7 @@ MOST_STRETCH = 1.6  # an edge that becomes longer or shorter by such a factor ha
 MOST_PX = 8.0  # an edge that moves farther than this is lost
 PLACES = np.linspace(0.0, 1.0, 9)  # parameters at which that is measured
 POLISHING, HARD = 4, 1e8  # rounds at the end in which contacts and relations become exact, and their weight there
+COLLAPSED = 0.01  # of the length of an edge: ends nearer to each other are one
 RIDGE = 1e-9  # relative; keeps what nothing speaks about where it is
 
 
@@ -302,6 +303,10 @@ def _touching(wireframe: Wireframe) -> Wireframe:
         for vertex, number in wireframe.contacts.tolist():
             touched = wireframe.edges[number].shape
             vertices[vertex] = touched.at(nearest_parameters(touched, vertices[vertex][None]))[0]
+        for edge in wireframe.edges:  # both ends at one place of another edge: nothing would be left of it
+            ends = list(edge.vertices)
+            if len(set(ends)) == 2 and np.linalg.norm(np.subtract(*vertices[ends])) < COLLAPSED * edge.shape.length:
+                vertices[ends] = wireframe.vertices[ends]
         wireframe = with_vertices(wireframe, vertices)
     return wireframe
 

@@ -17,11 +17,11 @@ from scipy.sparse import csr_matrix
 
 from taichi_edges.arrays.columns import Columns
 from taichi_edges.arrays.ranges import ragged, starts_of
+from taichi_edges.detectors.straight_runs import LEAST_LENGTH_PX, StraightRuns, runs_of
 from taichi_edges.evidence.edge_support import Support, support_of
 from taichi_edges.evidence.lying import EdgelsAbout
 from taichi_edges.geometry.shapes import Line, Shape, middles_of
 from taichi_edges.refinement.anchors import BEYOND_PX, Anchors, anchors_of
-from taichi_edges.refinement.straight_runs import LEAST_LENGTH_PX, StraightRuns, runs_of
 
 if TYPE_CHECKING:
     from taichi_edges.evidence.edgel_matching import EdgelMatching

@@ -12,7 +12,7 @@ from taichi_edges.arrays.ranges import ragged
 from taichi_edges.geometry.shapes import Shape
 
 if TYPE_CHECKING:
-    from taichi_edges.refinement.straight_runs import StraightRuns
+    from taichi_edges.detectors.straight_runs import StraightRuns
     from taichi_edges.views.cameras import Cameras
 
 BEYOND_PX = 8.0  # between the ends of edges that meet, see `junctions.REACH_PX`

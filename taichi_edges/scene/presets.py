@@ -7,6 +7,7 @@ from taichi_edges.scene.settings import SceneConfig
 # The schedule of the paper and its supplement, 500 epochs: 30 are a share of 0.06, 300 of 0.6.
 PAPER: dict[str, dict[str, Any]] = {
     "train": {
+        "enabled": True,
         "epochs": 500,
         "steps": 0,
         "settled": 0.0,
@@ -67,10 +68,9 @@ LARGE_IN_THE_PAPER: dict[
 PHOTOGRAPHED: dict[str, dict[str, Any]] = {
     "source": {"min_chain": 12, "tolerance_px": 0.7},
     "train": {
-        "seeds": "sweep",
+        "enabled": False,
+        "seeds": "pair",
         "gaussians": 60_000,
-        "steps": 200,
-        "density": {"cull_opacity_at": [0.7], "cull_support_at": [0.5, 0.75]},
     },
     "filter": {
         "min_opacity": 0.2,

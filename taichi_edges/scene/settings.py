@@ -160,16 +160,18 @@ class TrainConfig(Section):
     the views agree, a few passes are enough: fast rates, one smooth decay, no duplication.
     """
 
+    enabled: bool = Field(True, description="false: the Gaussians stay where they start, as for photographs")
     epochs: Annotated[int, Field(ge=0)] = Field(0, description="passes over all views; 0: train.steps counts")
     steps: Annotated[int, Field(ge=0)] = Field(100, description="view steps, at least one pass; 0: train.epochs counts")
     settled: Share = Field(
         0.01, description="stop when the last two passes lowered the loss by no more than this share each; 0: never"
     )
     gaussians: Count = Field(30_000, description="to start from, at most; random: so many")
-    seeds: Literal["auto", "random", "points", "lift", "sweep"] = Field(
+    seeds: Literal["auto", "random", "points", "lift", "pair"] = Field(
         "lift",
         description="random points in the box; points: source.points or the model's; lift: along strokes of edgels that"
-        " other views agree with; sweep: the same by single edgels; auto: points as far as there are any, else random",
+        " other views agree with; pair: along straight 2D runs, matched whole; auto: points as far as there are any,"
+        " else random",
     )
     initial_scale: Positive = Field(0.004, description="standard deviation, unit-cube units")
     initial_opacity: Annotated[float, Field(gt=0, lt=1)] = Field(0.3)

@@ -340,13 +340,7 @@ def _lift_view(
 ) -> np.ndarray:
     """(n, 4 CANDIDATES) of some edgels of a view, see `lift_rays`. scene: planes, edgels and cameras, uploaded."""
     eye, directions = rays.centres[view], rays.directions[own]
-    grown = views.box + MARGIN * np.ptp(views.box, axis=0) * [[-1.0], [1.0]]
-    near, far = through_box(eye, directions, grown)
-    near = np.maximum(near, SWEPT_FROM)
-    meets = far > near
-    nowhere = np.array([[1.0, 0.0]])  # no inverse depth lies between these
-    depths = np.where(meets[:, None], np.column_stack([far, near]), 1.0)
-    ranges = np.where(meets[:, None], 1.0 / depths, nowhere)
+    ranges = depth_ranges(views, eye, directions)
     assert views.edgels is not None
     angles, order, around, reach = [], [], [], []
     bounds, middle = views.edgels.starts, views.box.mean(axis=0)
@@ -360,8 +354,7 @@ def _lift_view(
         around.append(theirs[rising])
         reach.append(REACH * HALF_EDGEL_PX / views.intrinsics[other, 0, 0] / max(wide, 1e-3))
     starts = np.concatenate([[0], np.cumsum([len(part) for part in order])])
-    on_cpu = ti.lang.impl.current_cfg().arch == ti.cpu
-    workers, lanes = (threads(), LANES) if on_cpu else (len(own), 1)
+    workers, lanes = workers_for(len(own))
     scratch = [upload(np.zeros((workers, MOST_MEETINGS), np.float32)) for _ in range(4)]
     scratch += [upload(np.zeros((workers, MOST_MEETINGS), np.int32)) for _ in range(3)]
     normals = rays.planes[own, :3]
@@ -384,6 +377,28 @@ def _lift_view(
         found,
     )
     return download(found)
+
+
+def depth_ranges(views: Views, eye: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """(n, 2) least and greatest inverse depth on viewing rays of a camera, as far as they are in the box; none: 1, 0.
+
+    eye: (3,) of the camera. directions: (n, 3) depth 1.
+    """
+    grown = views.box + MARGIN * np.ptp(views.box, axis=0) * [[-1.0], [1.0]]
+    near, far = through_box(eye, directions, grown)
+    near = np.maximum(near, SWEPT_FROM)
+    meets = far > near
+    depths = np.where(meets[:, None], np.column_stack([far, near]), 1.0)
+    return np.where(meets[:, None], 1.0 / depths, [[1.0, 0.0]])
+
+
+def workers_for(count: int) -> tuple[int, int]:
+    """How many workers share a kernel's `count` rays, each with memory of its own, and how many lanes each of them has.
+
+    On a CPU as many as there are threads.
+    """
+    on_cpu = ti.lang.impl.current_cfg().arch == ti.cpu
+    return (threads(), LANES) if on_cpu else (count, 1)
 
 
 class _AnglesAbout:

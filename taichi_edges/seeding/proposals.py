@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taichi_edges.detectors.paths import ordered_paths
+from taichi_edges.detectors.straight_runs import runs_of as straight_runs_of
 from taichi_edges.evidence.edgel_matching import EdgelMatching
 from taichi_edges.evidence.lying import EdgelsAbout
 from taichi_edges.evidence.noise import (
@@ -25,6 +26,8 @@ from taichi_edges.evidence.noise import (
 )
 from taichi_edges.evidence.viewing_planes import refine_points
 from taichi_edges.seeding.lifting import lift_edgels
+from taichi_edges.seeding.pairing import paired_runs
+from taichi_edges.seeding.segments import fitted, likely, places_on
 from taichi_edges.seeding.tracing import SHORTEST, Strokes, traced
 from taichi_edges.views.views import Views
 
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
 LIKELY_OF, BIASED_PX = 3, 1.5  # edgels lifted for each likely point; by which biased ones may disagree
 PROBED = 16  # one edgel in so many tells the noise
 MOST_COUNTED = 8.0  # views: more do not make an edge surer, and shall not let one that many see take all around it
+EVERY_PX = 2.0  # between the points of a straight stroke
 LONGEST_GAP = 3  # points without support in the middle of a stroke
 
 
@@ -49,6 +53,16 @@ def propose(views: Views, matching: EdgelMatching, report: "Callable[[int], None
     placed = refine_points(matching, strokes.points, strokes.directions, radii, SCALE_NOISES * noise)
     strokes = Strokes(placed.points, placed.directions, strokes.edgels, strokes.numbers)
     return explaining(matching, strokes, noise)
+
+
+def propose_straight(views: Views, matching: EdgelMatching, report: "Callable[[int], None] | None" = None) -> Strokes:
+    """The straight Strokes that explain the edgels of Views, from whole 2D runs. Arguments as for `propose`."""
+    runs = straight_runs_of(matching.edgels, np.ones(len(matching.edgels), bool))
+    segments = likely(matching, fitted(matching, paired_runs(views, runs, report)))
+    points, own, _ = places_on(segments, matching.pixel_at(segments.middles), EVERY_PX)
+    directions = segments.ways[own]
+    noise = noise_of(matching, refine_points(matching, points, directions))
+    return explaining(matching, Strokes(points, directions, np.full(len(points), -1), own), noise)
 
 
 def noise_of_views(views: Views, matching: EdgelMatching) -> float:
