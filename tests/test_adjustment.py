@@ -9,7 +9,7 @@ from edgel_scenes import either_errors, line, views_of
 from taichi_edges.evidence.edgel_matching import EdgelMatching
 from taichi_edges.geometry.shapes import EllipticArc, Line, Spline
 from taichi_edges.geometry.wireframe import Edge, Wireframe
-from taichi_edges.refinement.adjustment import Constraint, adjusted, with_vertices
+from taichi_edges.refinement.adjustment import Constraint, adjusted, touching, with_vertices
 from taichi_edges.refinement.charts import LEAST_HALF, derivatives, moved, nearest_parameters, neighbors, own_unknowns
 
 CORNERS = np.array([[0.3, 0.3, 0.3], [0.7, 0.32, 0.3], [0.32, 0.7, 0.35], [0.28, 0.3, 0.75]])
@@ -198,6 +198,14 @@ def test_touching_vertex_is_exactly_on_the_edge(taichi, generator, kind, errors)
     np.testing.assert_allclose(found.shapes[0].ends[0], vertex, atol=1e-12)
     assert np.linalg.norm(vertex - place) < 0.2 * matching.pixel
     assert off(other, touched) < 0.06 * matching.pixel
+
+
+def test_an_edge_that_touches_another_with_both_ends_at_one_place_stays_an_edge():
+    post = Line(np.array([[0.5, 0.5, 0.2], [0.5, 0.5, 0.8]]))
+    bow = EllipticArc(np.array([0.52, 0.5, 0.5]), 0.03 * np.eye(3)[:2], -2.6, 2.6)
+    loose = Wireframe.loose([post, bow])
+    found = touching(replace(loose, contacts=np.array([[2, 0], [3, 0]])))
+    np.testing.assert_allclose(found.shapes[1].ends, bow.ends, atol=1e-12)
 
 
 def test_flip_is_refused(taichi, generator):

@@ -172,7 +172,7 @@ def adjusted(
     for radius in radii:
         image = image_equations(problem, wireframe, matching, radius)
         wireframe = _stepped(problem, wireframe, image)
-    return _touching(_polished(problem, wireframe, image.matrix()))
+    return touching(_polished(problem, wireframe, image.matrix()))
 
 
 def image_equations(problem: Problem, wireframe: Wireframe, matching: "EdgelMatching", radius: float) -> Equations:
@@ -296,7 +296,7 @@ def _polished(problem: Problem, wireframe: Wireframe, matrix: csc_matrix) -> Wir
     return wireframe
 
 
-def _touching(wireframe: Wireframe) -> Wireframe:
+def touching(wireframe: Wireframe) -> Wireframe:
     """The Wireframe with the vertices that touch edges exactly on these."""
     for _ in range(POLISHING if len(wireframe.contacts) else 0):
         vertices = wireframe.vertices.copy()
