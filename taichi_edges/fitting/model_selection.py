@@ -111,9 +111,9 @@ def shape_candidates(track: Track, yardstick: Yardstick) -> list[tuple[int, Fit]
 
 
 def bent_shape(track: Track, tolerance: float) -> Line | EllipticArc | None:
-    """The circular arc through a Track, or None where it is as good as straight."""
+    """The circular arc through a Track, or None where it is as good as straight, or the fit runs away."""
     arc = fitted_arc(track, tolerance, fitted_line(track, tolerance))
-    return arc.shape() if arc is not None else None
+    return arc.shape() if arc is not None and np.isfinite([arc.low, arc.high, *arc.origin, *arc.bend]).all() else None
 
 
 def fitted_spline(track: Track, tolerance: float, cubics: int) -> Spline:
