@@ -85,7 +85,7 @@ def _lifted(run: "Run", views: Views) -> "tuple[Gaussians | None, np.ndarray | N
         strokes = propose(views, matching, report)
     if len(strokes) < min(LEAST_SEEDS, config.gaussians):
         return None, None
-    return stroke_gaussians(strokes, matching.pixel, config.gaussians, config.initial_opacity)
+    return stroke_gaussians(strokes, matching.pixel_at(strokes.points), config.gaussians, config.initial_opacity)
 
 
 def _swept(run: "Run", views: Views) -> "tuple[Gaussians | None, str]":
