@@ -21,13 +21,14 @@ def clusters(generator):
     arc = Arc(points[0], directions[0], np.zeros(3), -0.1, 0.2)
     circle = Arc(points[1], directions[1], directions[2], np.float64(-0.3), np.float64(0.3), True)
     labels = np.array([0, 0, 1, 1, -1, 2, 2, -1])
-    return Clusters(points, directions, labels, np.array([[2, 0]]), (arc, None, circle))
+    return Clusters(points, directions, labels, np.array([[2, 0]]), (arc, None, circle), 0.4)
 
 
 def assert_same(found, expected):
     """Two Clusters agree to the last bit."""
     for name in ("points", "directions", "labels", "shared"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    assert found.noise_px == expected.noise_px
     assert [arc is None for arc in found.arcs] == [arc is None for arc in expected.arcs]
     for one, other in zip(found.arcs, expected.arcs, strict=True):
         for name in FIELDS if one is not None else ():

@@ -104,7 +104,30 @@ def test_strokes_become_the_edges_of_their_stretches(generator):
     points, _ = slot(generator)
     circle = noisy(generator, bend([0, 0, 0], 30, 0, 2))
     every, strokes = np.concatenate([points, circle]), np.repeat([0, 4], [len(points), len(circle)])
-    clusters = assemble_strokes(every, np.tile([1.0, 0, 0], (len(every), 1)), strokes, YARDSTICK)
-    assert clusters.noise == YARDSTICK.noise and len(clusters.arcs) == 4 and (np.diff(clusters.labels) >= 0).all()
-    edges, counts = fit_strokes(clusters, PIXEL)
+    pixels = np.full(len(every), PIXEL)
+    clusters = assemble_strokes(every, np.tile([1.0, 0, 0], (len(every), 1)), strokes, pixels, YARDSTICK)
+    assert (
+        clusters.noise_px == pytest.approx(YARDSTICK.noise / PIXEL)
+        and len(clusters.arcs) == 4
+        and (np.diff(clusters.labels) >= 0).all()
+    )
+    edges, counts = fit_strokes(clusters, pixels)
     assert (counts["line"], counts["curve"], len(edges)) == (2, 2, 4)
+
+
+def kinds_and_counts(parts, pixels):
+    """The kinds of the edges of strokes, and the number of points of each. pixels: (n,) size of one at each point."""
+    points, strokes = np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    clusters = assemble_strokes(points, np.tile([1.0, 0, 0], (len(points), 1)), strokes, pixels, YARDSTICK)
+    kinds = [shape.kind for shape in fit_strokes(clusters, pixels)[0].shapes]
+    return kinds, np.bincount(clusters.labels).tolist()
+
+
+def test_a_stroke_twice_as_far_is_cut_and_fitted_as_the_near_one(generator):
+    """All is twice as large there, noise as well: the views show the same. With one pixel for both, noise is a bend."""
+    near, _ = slot(generator)
+    near += 3 * NOISE * generator.normal(size=near.shape)
+    parts, pixels = [near, 2 * near], np.repeat([PIXEL, 2 * PIXEL], len(near))
+    kinds, counts = kinds_and_counts(parts, pixels)
+    assert kinds == ["line", "arc", "line"] * 2 and counts[:3] == counts[3:]
+    assert len(kinds_and_counts(parts, np.full(2 * len(near), PIXEL))[0]) > 6

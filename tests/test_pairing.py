@@ -144,3 +144,14 @@ def test_no_training_leaves_the_gaussians_where_they_start(taichi, generator, tm
     start, strokes = train.start_of_training(run, views, np.random.default_rng(0))
     assert facts == {"gaussians": len(start), "view_steps": 0, "final_loss": None} and len(np.unique(strokes)) == 3
     assert (tmp_path / "run" / "train_log.csv").read_text().count("\n") == 1
+
+
+def test_three_views_are_lifted_and_it_is_said(taichi, generator, tmp_path):
+    views = views_of(LINES, generator, noise_px=NOISE_PX, count=3, apart=1.0)
+    told = []
+    progress = Progress()
+    progress.warn = told.append
+    config = SceneConfig(name="few", source={"reader": "colmap", "path": "anywhere"}, train={"seeds": "pair"})
+    run = Run(config, tmp_path, threads=2, progress=progress)
+    train.start_of_training(run, views, generator)
+    assert "3 views" in told[0] and "lifted instead" in told[0]

@@ -11,7 +11,7 @@ from taichi_edges.corridor import train
 from taichi_edges.corridor.pipeline import Run
 from taichi_edges.files.ply import write_float_vertices
 from taichi_edges.scene.settings import SceneConfig
-from taichi_edges.seeding.starts import random_points, stroke_gaussians
+from taichi_edges.seeding.starts import ACROSS_PX, ALONG_PX, random_points, stroke_gaussians
 from taichi_edges.seeding.tracing import Strokes
 from taichi_edges.splatting.gaussians import orient_gaussians
 from taichi_edges.views.edgels import Edgels
@@ -40,8 +40,10 @@ def test_gaussians_lie_along_strokes_evenly_and_know_which(generator):
     points, numbers = generator.random((90, 3)), np.repeat([0, 1, 2], 30)
     along = np.tile([0.0, 0.6, 0.8], (90, 1))
     strokes = Strokes(points, along, np.arange(90), numbers)
+    pixels = generator.uniform(0.001, 0.004, 90)
     for most, step in ((90, 1), (89, 2), (30, 3)):
-        gaussians, own = stroke_gaussians(strokes, 0.002, most, 0.3)
+        gaussians, own = stroke_gaussians(strokes, pixels, most, 0.3)
+        np.testing.assert_allclose(gaussians.scales, pixels[::step, None] * [ALONG_PX, ACROSS_PX, ACROSS_PX], rtol=1e-5)
         np.testing.assert_allclose(gaussians.means, points[::step], atol=1e-6)
         np.testing.assert_array_equal(own, numbers[::step])
         assert gaussians.opacities == pytest.approx(0.3)

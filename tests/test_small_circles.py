@@ -24,30 +24,40 @@ def ring(generator, radius_px, pieces, share=1.0, noise_px=0.12):
     return points, ways / np.linalg.norm(ways, axis=1, keepdims=True), np.arange(count) * pieces // count
 
 
+def found_among(points, ways, strokes, pixel=PIXEL):
+    """Small circles where all pixels are of one size."""
+    return small_circles(points, ways, strokes, np.full(len(points), pixel), YARDSTICK)
+
+
 @pytest.mark.parametrize("pieces", [1, 3])
 @pytest.mark.parametrize("radius_px", [1.5, 3.0, 7.0])
 def test_a_small_circle_is_found_in_pieces_and_whole(generator, radius_px, pieces):
     points, ways, strokes = ring(generator, radius_px, pieces)
-    (circle, members), *others = small_circles(points, ways, strokes, YARDSTICK)
+    (circle, members), *others = found_among(points, ways, strokes)
     assert not others and circle.closed and len(members) >= 0.8 * len(points)
     assert 1 / circle.curvature == pytest.approx(radius_px * PIXEL, rel=0.1)
     middle = circle.at(np.linspace(circle.low, circle.high, 40, endpoint=False)).mean(axis=0)
     assert np.linalg.norm(middle - CENTRE) < 0.2 * PIXEL
 
 
+def test_a_circle_twice_as_far_may_be_twice_as_large(generator):
+    points, ways, strokes = ring(generator, 6.0, 3)
+    assert len(found_among(2 * points, ways, strokes, 2 * PIXEL)) == 1 and not found_among(2 * points, ways, strokes)
+
+
 def test_circles_one_above_the_other_are_two(generator):
     points, ways, strokes = ring(generator, 3.0, 2)
     normal = np.linalg.svd(points - points.mean(axis=0))[2][2]
     lower = points - 4 * PIXEL * normal
-    both = small_circles(
-        np.concatenate([points, lower]), np.concatenate([ways, ways]), np.concatenate([strokes, strokes + 2]), YARDSTICK
+    both = found_among(
+        np.concatenate([points, lower]), np.concatenate([ways, ways]), np.concatenate([strokes, strokes + 2])
     )
     assert len(both) == 2 and not set(both[0][1]) & set(both[1][1])
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5])
 def test_an_arc_is_no_circle(generator, share):
-    assert small_circles(*ring(generator, 5.0, 1, share), YARDSTICK) == []
+    assert found_among(*ring(generator, 5.0, 1, share)) == []
 
 
 def test_a_square_of_eight_pixels_is_no_circle(generator):
@@ -58,7 +68,7 @@ def test_a_square_of_eight_pixels_is_no_circle(generator):
     points = CENTRE + PIXEL * np.column_stack([flat, np.zeros(len(flat))])
     points = points + 0.1 * PIXEL * generator.normal(size=points.shape)
     strokes = np.repeat(np.arange(4), len(along))
-    assert small_circles(points, np.column_stack([ways, np.zeros(len(ways))]), strokes, YARDSTICK) == []
+    assert found_among(points, np.column_stack([ways, np.zeros(len(ways))]), strokes) == []
 
 
 def test_scattered_short_strokes_are_none(generator):
@@ -66,13 +76,13 @@ def test_scattered_short_strokes_are_none(generator):
     starts, ways = generator.uniform(-8, 8, size=(count, 1, 3)), generator.normal(size=(count, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     points = CENTRE + PIXEL * (starts + np.arange(4)[None, :, None] * ways[:, None]).reshape(-1, 3)
-    assert small_circles(points, np.repeat(ways, 4, axis=0), np.repeat(np.arange(count), 4), YARDSTICK) == []
+    assert found_among(points, np.repeat(ways, 4, axis=0), np.repeat(np.arange(count), 4)) == []
 
 
 def test_nothing_gives_nothing():
-    assert small_circles(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64), YARDSTICK) == []
+    assert found_among(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64)) == []
     one = np.array([[0.5, 0.5, 0.5]])
-    assert small_circles(one, np.eye(3)[:1], np.zeros(1, np.int64), YARDSTICK) == []
+    assert found_among(one, np.eye(3)[:1], np.zeros(1, np.int64)) == []
 
 
 def test_clusters_of_strokes_hold_the_circle_and_it_is_fitted_as_one(generator):
@@ -82,8 +92,9 @@ def test_clusters_of_strokes_hold_the_circle_and_it_is_fitted_as_one(generator):
         np.concatenate([points, line]),
         np.concatenate([ways, np.tile([0.0, 1.0, 0.0], (40, 1))]),
         np.concatenate([strokes, np.full(40, 3)]),
+        pixels := np.full(len(points) + 40, PIXEL),
         YARDSTICK,
     )
-    wireframe, counts = fit_strokes(clusters, PIXEL)
+    wireframe, counts = fit_strokes(clusters, pixels)
     assert sorted(shape.kind for shape in wireframe.shapes) == ["circle", "line"]
     assert counts["loop"] == 1 and counts["line"] == 1

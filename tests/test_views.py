@@ -67,6 +67,7 @@ def test_pixel_at_a_place_is_the_median_of_the_views_that_have_it_in_their_image
     expected = [np.median(some[np.isfinite(some)]) if np.isfinite(some).any() else np.nan for some in sizes]
     assert 100 < np.isnan(expected).sum() < len(points) - 100
     np.testing.assert_allclose(cameras.pixel_at(points, views.width, views.height), expected, rtol=1e-9)
+    np.testing.assert_array_equal(cameras.pixel_at(points, views.width, views.height, 0.25)[np.isnan(expected)], 0.25)
     assert cameras.pixel_at(np.zeros((0, 3)), views.width, views.height).shape == (0,)
 
 

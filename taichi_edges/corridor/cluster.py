@@ -65,8 +65,9 @@ def _of_strokes(
     trusted, strokes, noise, counts = points_on_strokes(
         matching, means, directions, gaussians.opacities, strokes, least, run.config.train.enabled
     )
-    yardstick = Yardstick(float(np.hypot(BIAS_PX, PLACE_NOISES * noise)) * matching.pixel, matching.pixel)
-    clusters = assemble_strokes(trusted.points, trusted.directions, strokes, yardstick)
+    in_px = Yardstick(float(np.hypot(BIAS_PX, PLACE_NOISES * noise)), 1.0)
+    pixels = matching.pixel_at(trusted.points)
+    clusters = assemble_strokes(trusted.points, trusted.directions, strokes, pixels, in_px)
     return clusters, {**asdict(counts), "edgel_noise_px": noise}
 
 

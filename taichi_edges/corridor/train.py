@@ -76,12 +76,18 @@ def _proposed(run: "Run", views: Views) -> "tuple[Gaussians | None, np.ndarray |
     """Gaussians laid along the strokes that explain the edgels, and their strokes; None where they are too few."""
     from taichi_edges.evidence.edgel_matching import EdgelMatching
     from taichi_edges.seeding.proposals import propose, propose_straight
+    from taichi_edges.seeding.segments import LEAST_VIEWS
     from taichi_edges.seeding.starts import LEAST_SEEDS, stroke_gaussians
 
-    config = run.config.train
+    config, paired = run.config.train, run.config.train.seeds == "pair"
+    if paired and len(views) < LEAST_VIEWS:
+        problem = f"{len(views)} views, and an edge is believed that {LEAST_VIEWS} show"
+        cure = "take more pictures, each from near the one before"
+        run.progress.warn(f"{problem}: {cure}; the edgels are lifted instead")
+        paired = False
     matching = EdgelMatching(views, run.config.filter.min_views)
-    with run.progress.track(config.seeds, len(views)) as report:
-        strokes = (propose if config.seeds == "lift" else propose_straight)(views, matching, report)
+    with run.progress.track("pair" if paired else "lift", len(views)) as report:
+        strokes = (propose_straight if paired else propose)(views, matching, report)
     if len(strokes) < min(LEAST_SEEDS, config.gaussians):
         return None, None
-    return stroke_gaussians(strokes, matching.pixel, config.gaussians, config.initial_opacity)
+    return stroke_gaussians(strokes, matching.pixel_at(strokes.points), config.gaussians, config.initial_opacity)

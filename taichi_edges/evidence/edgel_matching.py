@@ -58,8 +58,7 @@ class EdgelMatching:
     def pixel_at(self, points: np.ndarray) -> np.ndarray:
         """(n,) size of a pixel at each of (n, 3) points, see `Cameras.pixel_at`; at the scene where no view has it."""
         height, width = self.size
-        sizes = self.every_camera.pixel_at(points, width, height)
-        return np.where(np.isnan(sizes), self.pixel, sizes)
+        return self.every_camera.pixel_at(points, width, height, self.pixel)
 
     @cached_property
     def neighbors(self) -> np.ndarray:

@@ -9,7 +9,7 @@ from taichi_edges.splatting.gaussians import Gaussians, orient_gaussians
 if TYPE_CHECKING:
     from taichi_edges.seeding.tracing import Strokes
 
-ALONG_PX, ACROSS_PX = 2.0, 0.7  # standard deviations of a Gaussian laid along an edge, in pixels at the scene
+ALONG_PX, ACROSS_PX = 2.0, 0.7  # standard deviations of a Gaussian laid along an edge
 LEAST_SEEDS = 50  # fewer are no start
 
 
@@ -26,11 +26,14 @@ def given_points(points: np.ndarray, count: int, generator: np.random.Generator)
     return points[np.sort(generator.choice(len(points), count, replace=False))]
 
 
-def stroke_gaussians(strokes: "Strokes", pixel: float, count: int, opacity: float) -> tuple[Gaussians, np.ndarray]:
+def stroke_gaussians(
+    strokes: "Strokes", pixels: np.ndarray, count: int, opacity: float
+) -> tuple[Gaussians, np.ndarray]:
     """Gaussians laid along Strokes, at most `count`, evenly; and (n,) the stroke of each.
 
-    pixel: size of a pixel at the scene, unit-cube units. opacity: 0..1.
+    pixels: size of a pixel at each point of the strokes, unit-cube units. opacity: 0..1.
     """
-    some = strokes.keep(slice(None, None, max(-(-len(strokes) // count), 1)))
-    laid = orient_gaussians(some.points, some.directions, ALONG_PX * pixel, ACROSS_PX * pixel, opacity)
+    chosen = slice(None, None, max(-(-len(strokes) // count), 1))
+    some, pixels = strokes.keep(chosen), pixels[chosen]
+    laid = orient_gaussians(some.points, some.directions, ALONG_PX * pixels, ACROSS_PX * pixels, opacity)
     return laid, some.numbers

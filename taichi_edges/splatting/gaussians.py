@@ -77,9 +77,10 @@ def orient_gaussians(
 ) -> Gaussians:
     """Gaussians at (n, 3) points with their first axis along (n, 3) unit `directions`.
 
-    along, across: standard deviations along that axis and across it, unit-cube units. opacity: 0..1.
+    along, across: standard deviations along that axis and across it, (n,) or of all, unit-cube units. opacity: 0..1.
     """
     count = len(points)
+    scales = np.stack([np.broadcast_to(scale, count) for scale in (along, across, across)], axis=1)
     # The shortest rotation from the x axis to the direction; for the opposite direction, half a turn about z.
     x_axis = np.array([1.0, 0.0, 0.0])
     quaternions = np.concatenate([1 + directions @ x_axis[:, None], np.cross(x_axis, directions)], axis=1)
@@ -87,7 +88,7 @@ def orient_gaussians(
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     return Gaussians(
         means=np.asarray(points, dtype=np.float32),
-        log_scales=np.log(np.tile([along, across, across], (count, 1))).astype(np.float32),
+        log_scales=np.log(scales).astype(np.float32),
         quaternions=quaternions.astype(np.float32),
         opacity_logits=np.full(count, logit(opacity), dtype=np.float32),
     )

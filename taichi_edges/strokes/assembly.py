@@ -84,31 +84,38 @@ def left_over(cloud: Cloud, graph: NeighborGraph, owner: np.ndarray, config: "Cl
     return labels
 
 
-def assemble_strokes(points: np.ndarray, directions: np.ndarray, strokes: np.ndarray, yardstick: Yardstick) -> Clusters:
+def assemble_strokes(
+    points: np.ndarray, directions: np.ndarray, strokes: np.ndarray, pixels: np.ndarray, yardstick: Yardstick
+) -> Clusters:
     """The Clusters of oriented points that are in order along strokes: small circles, and of each stroke its stretches.
 
-    points, directions: (n, 3) unit cube, unit vectors. strokes: (n,) int, rising. yardstick: Yardstick.
+    points, directions: (n, 3) unit cube, unit vectors. strokes: (n,) int, rising. pixels: (n,) size of a pixel at each
+    point, unit-cube units. yardstick: Yardstick where a pixel has any size. A stroke has the median pixel of its
+    points: some of them may be in fewer images than the rest.
     """
-    labels, circles = np.full(len(points), UNASSIGNED), small_circles(points, directions, strokes, yardstick)
+    labels = np.full(len(points), UNASSIGNED)
+    circles = small_circles(points, directions, strokes, pixels, yardstick)
     for number, (_, members) in enumerate(circles):
         labels[members] = number
     left, count = np.flatnonzero(labels == UNASSIGNED), len(circles)
-    for members in np.split(left, np.flatnonzero(np.diff(strokes[left])) + 1):
-        for stretch in cut_stroke(points[members], yardstick) if len(members) else ():
+    for members in np.split(left, np.flatnonzero(np.diff(strokes[left])) + 1) if len(left) else ():
+        own = yardstick.at(float(np.median(pixels[members])))
+        for stretch in cut_stroke(points[members], own):
             labels[members[stretch]] = count
             count += 1
     arcs = (*(circle for circle, _ in circles), *[None] * (count - len(circles)))
-    return Clusters(points, directions, labels, np.zeros((0, 2), np.int64), arcs, yardstick.noise)
+    return Clusters(points, directions, labels, np.zeros((0, 2), np.int64), arcs, yardstick.at(1.0).noise)
 
 
-def fit_strokes(clusters: Clusters, pixel: float) -> tuple[Wireframe, dict[str, int]]:
+def fit_strokes(clusters: Clusters, pixels: np.ndarray) -> tuple[Wireframe, dict[str, int]]:
     """The loose Wireframe of Clusters whose points are in order, and the dict kind -> number of edges.
 
-    pixel: size of a pixel at the scene, unit-cube units.
+    pixels: (n,) size of a pixel at each point, unit-cube units; an edge has the median of its points.
     """
-    yardstick, fits = Yardstick(clusters.noise, pixel), []
+    yardstick, fits = Yardstick(clusters.noise_px, 1.0), []
     for members, circle in zip(members_of_clusters(clusters.labels), clusters.arcs, strict=True):
-        shape = circle.shape() if circle else shape_of_stretch(clusters.points[np.sort(members)], yardstick)
+        own = yardstick.at(float(np.median(pixels[members])))
+        shape = circle.shape() if circle else shape_of_stretch(clusters.points[np.sort(members)], own)
         kind = "short" if shape is None else "loop" if shape.closed else "line" if shape.kind == "line" else "curve"
         fits.append(ClusterFit(kind, shape))
     return wireframe_of(fits)

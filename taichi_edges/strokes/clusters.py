@@ -21,8 +21,8 @@ class Clusters:
 
     points, directions: (n, 3) unit cube, and unit vectors, sign arbitrary. labels: (n,) int, the edge that each point
     belongs to, UNASSIGNED for none. shared: (k, 2) int, a point, and an edge it lies on as well. arcs: (m,) of each
-    edge the Arc, a line or an arc of a circle, that it is known to be; None for a free curve. noise: standard deviation
-    of the points across their edge, unit-cube units, where those of each edge are in order along it; 0 where not.
+    edge the Arc, a line or an arc of a circle, that it is known to be; None for a free curve. noise_px: standard
+    deviation of the points across their edge, px, where those of each edge are in order along it; 0 where not.
     """
 
     points: np.ndarray
@@ -30,13 +30,13 @@ class Clusters:
     labels: np.ndarray
     shared: np.ndarray
     arcs: tuple[Arc | None, ...]
-    noise: float = 0.0
+    noise_px: float = 0.0
 
     @staticmethod
-    def of(points: np.ndarray, directions: np.ndarray, labels: np.ndarray, noise: float = 0.0) -> "Clusters":
-        """Points of free curves only, each on one of them. labels: 0 .. m - 1, or UNASSIGNED. noise: see above."""
+    def of(points: np.ndarray, directions: np.ndarray, labels: np.ndarray) -> "Clusters":
+        """Points of free curves only, each on one of them. labels: 0 .. m - 1, or UNASSIGNED."""
         curves = (None,) * int(labels.max(initial=UNASSIGNED) + 1)
-        return Clusters(points, directions, labels, np.zeros((0, 2), np.int64), curves, noise)
+        return Clusters(points, directions, labels, np.zeros((0, 2), np.int64), curves)
 
     def keep(self, chosen: np.ndarray) -> "Clusters":
         """Only the chosen edges, renumbered, and all points. chosen: (m,) bool."""
@@ -82,7 +82,7 @@ def _arrays(clusters: Clusters) -> dict[str, Any]:
         "labels": clusters.labels.astype(np.int64),
         "shared": clusters.shared.astype(np.int64),
         "has_arc": np.array([arc is not None for arc in clusters.arcs], bool),
-        "noise": np.array([clusters.noise], np.float64),
+        "noise_px": np.array([clusters.noise_px], np.float64),
         **{f"arc_{field.name}": getattr(arcs, field.name) for field in fields(arcs)},
     }
 
@@ -104,8 +104,8 @@ def _checked(arrays: dict[str, np.ndarray]) -> Clusters:
         raise ValueError("its labels are not those of its edges")
     if ((shared < 0) | (shared >= [len(points), len(has_arc)])).any():
         raise ValueError("it shares points or edges that it has not")
-    if len(arrays["noise"]) != 1 or arrays["noise"][0] < 0:
+    if len(arrays["noise_px"]) != 1 or arrays["noise_px"][0] < 0:
         raise ValueError("its noise is no standard deviation")
     found = iter(arcs)
     known = tuple(next(found) if has else None for has in has_arc)
-    return Clusters(points, directions, labels, shared, known, float(arrays["noise"][0]))
+    return Clusters(points, directions, labels, shared, known, float(arrays["noise_px"][0]))

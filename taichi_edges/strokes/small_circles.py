@@ -48,26 +48,29 @@ class Circle:
 
 
 def small_circles(
-    points: np.ndarray, directions: np.ndarray, strokes: np.ndarray, yardstick: Yardstick
+    points: np.ndarray, directions: np.ndarray, strokes: np.ndarray, pixels: np.ndarray, yardstick: Yardstick
 ) -> list[tuple[Arc, np.ndarray]]:
     """Small circles on which oriented points lie, each as a closed Arc and the indices of its points, each on one.
 
     points, directions: (n, 3) unit cube, unit vectors. strokes: (n,) int, rising: points of a stroke are in order.
+    pixels: (n,) size of a pixel at each point, unit-cube units. yardstick: Yardstick where a pixel has any size; a
+    circle has the median pixel of the points that propose it.
     """
-    members = np.flatnonzero(of_short_strokes(points, strokes, 2 * np.pi * MOST_PX * yardstick.pixel))
+    members = np.flatnonzero(of_short_strokes(points, strokes, pixels, 2 * np.pi * MOST_PX))
     if len(members) < FEWEST:
         return []
-    points, directions, strokes = points[members], directions[members], strokes[members]
+    points, directions, strokes, pixels = (array[members] for array in (points, directions, strokes, pixels))
     tree, found = cKDTree(points), []
     for proposal in proposals(points, directions, strokes):
-        circle = fitted(points, directions, proposal, yardstick)
+        here = yardstick.at(float(np.median(pixels[proposal])))
+        circle = fitted(points, directions, proposal, here)
         for _ in range(ROUNDS):
             if circle is None:
                 break
-            near, on = about(circle, points, directions, tree, yardstick)
-            circle = fitted(points, directions, near[on], yardstick) if on.sum() >= FEWEST else None
+            near, on = about(circle, points, directions, tree, here)
+            circle = fitted(points, directions, near[on], here) if on.sum() >= FEWEST else None
         if circle is not None:
-            near, on = about(circle, points, directions, tree, yardstick)
+            near, on = about(circle, points, directions, tree, here)
             if on.sum() >= FEWEST and on.mean() >= CLEAN and goes_round(circle, points[near[on]]):
                 found.append((circle, near[on]))
     found.sort(key=lambda one: -len(one[1]))
@@ -79,11 +82,11 @@ def small_circles(
     return chosen
 
 
-def of_short_strokes(points: np.ndarray, strokes: np.ndarray, longest: float) -> np.ndarray:
-    """(n,) bool: which points belong to a stroke that is no longer than `longest`."""
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1) * (np.diff(strokes) == 0)
+def of_short_strokes(points: np.ndarray, strokes: np.ndarray, pixels: np.ndarray, longest_px: float) -> np.ndarray:
+    """(n,) bool: which points belong to a stroke that is no longer than `longest_px`. pixels: (n,) their sizes."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1) / pixels[1:] * (np.diff(strokes) == 0)
     number = np.cumsum(np.diff(strokes, prepend=strokes[:1]) != 0)
-    return np.bincount(number[1:], steps, number[-1] + 1)[number] <= longest if len(points) > 1 else strokes >= 0
+    return np.bincount(number[1:], steps, number[-1] + 1)[number] <= longest_px if len(points) > 1 else strokes >= 0
 
 
 def proposals(points: np.ndarray, directions: np.ndarray, strokes: np.ndarray) -> Iterator[np.ndarray]:

@@ -128,8 +128,8 @@ class Cameras:
         depths = homogeneous[:, 2]
         return homogeneous[:, :2] / np.where(depths > NEAR, depths, np.nan)[:, None], depths
 
-    def pixel_at(self, points: np.ndarray, width: int, height: int) -> np.ndarray:
-        """(n,) size of a pixel at each of (n, 3) points, in their units; NaN where no view has it in its image.
+    def pixel_at(self, points: np.ndarray, width: int, height: int, otherwise: float = np.nan) -> np.ndarray:
+        """(n,) size of a pixel at each of (n, 3) points, in their units; `otherwise` where no view has it in its image.
 
         Depth / focal length, the median over the views that have the point in their image: neither a close-up nor a
         view from afar tells how well all of them together see a place. width, height: of the images, px.
@@ -144,7 +144,7 @@ class Cameras:
             counts = inside.sum(axis=0)
             middle = np.clip([(counts - 1) // 2, counts // 2], 0, len(sizes) - 1)
             medians = np.take_along_axis(sizes, middle, axis=0).mean(axis=0)
-            found.append(np.where(counts > 0, medians, np.nan))
+            found.append(np.where(counts > 0, medians, otherwise))
         return np.concatenate(found)
 
 
