@@ -86,18 +86,10 @@ def missing_data(scene, data_root):
     return None
 
 
-def run_scene(scene, preset, seed, options, cache):
-    """Run the command once in a new folder; its artefacts are thrown away. Returns Measured.
-
-    preset, seed: None for those of the scene. cache: XDG_CACHE_HOME.
-    """
-    known, environment = compiled_kernels(cache), {**os.environ, "XDG_CACHE_HOME": str(cache)}
-    with tempfile.TemporaryDirectory() as out, tempfile.TemporaryFile("w+") as messages:
-        command = [sys.executable, str(ROOT / "run.py"), str(scene), "--out", out, "--quiet"]
-        command += ["--threads", str(options.threads), "--arch", options.arch]
-        command += ["--preset", preset] if preset else []
-        command += ["--seed", str(seed)] if seed is not None else []
-        started = time.perf_counter()
+def run_command(command, cache):
+    """Seconds that a command takes, and its `resource` usage. cache: XDG_CACHE_HOME. SystemExit where it fails."""
+    with tempfile.TemporaryFile("w+") as messages:
+        environment, started = {**os.environ, "XDG_CACHE_HOME": str(cache)}, time.perf_counter()
         process = subprocess.Popen(
             command, stdout=subprocess.DEVNULL, stderr=messages, env=environment, cwd=ROOT, text=True
         )
@@ -107,6 +99,21 @@ def run_scene(scene, preset, seed, options, cache):
         if process.returncode:
             messages.seek(0)
             raise SystemExit(f"{' '.join(command)}\nended with status {process.returncode}:\n{messages.read()}")
+    return wall, usage
+
+
+def run_scene(scene, preset, seed, options, cache):
+    """Run the command once in a new folder; its artefacts are thrown away. Returns Measured.
+
+    preset, seed: None for those of the scene. cache: XDG_CACHE_HOME.
+    """
+    known = compiled_kernels(cache)
+    with tempfile.TemporaryDirectory() as out:
+        command = [sys.executable, str(ROOT / "run.py"), str(scene), "--out", out, "--quiet"]
+        command += ["--threads", str(options.threads), "--arch", options.arch]
+        command += ["--preset", preset] if preset else []
+        command += ["--seed", str(seed)] if seed is not None else []
+        wall, usage = run_command(command, cache)
         (folder,) = Path(out).iterdir()
         record = json.loads((folder / "run.json").read_text())
         metrics = json.loads((folder / "metrics.json").read_text())

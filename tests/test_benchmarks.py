@@ -14,6 +14,7 @@ from benchmarks.edge_scene import NOISE_PX, make_scene, scatter_gaussians
 from benchmarks.floor import FloorDiffers, FloorMissing, FloorStep, assert_same, compile_floor
 from benchmarks.log_plot import log_ticks, tick_text
 from benchmarks.markdown import significant, table
+from benchmarks.photographs import cell, distances_to, row_of
 from benchmarks.scaling import slopes
 from benchmarks.view_step import PARTS, DumpedStep, part_of
 from benchmarks.wireframe import STEP_COLUMNS, STEPS, cells, measure_part, scene_path
@@ -227,3 +228,19 @@ def test_slopes_are_exponents():
     np.testing.assert_allclose(slopes(xs, [3 * x**1.5 for x in xs]), 1.5)
     np.testing.assert_allclose(slopes(xs, [1, 1, 1, 4])[1], 1.0)
     assert slopes([5.0], [1.0]) == (None, None)
+
+
+def test_photographs_are_held_against_creases_that_run_the_same_way():
+    x, y = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])
+    places = np.zeros((1, 3))
+    assert distances_to(places, x, places + 0.2 * y, x, 0.3) == pytest.approx([0.2])
+    assert (
+        distances_to(places, x, places + 0.2 * y, y, 0.3)
+        == distances_to(places, x, places + 0.4 * y, x, 0.3)
+        == [np.inf]
+    )
+    along = np.linspace(0, 9, 10)[:, None] * x
+    assert abs(row_of(along + 0.3 * np.sin(3 * along[:, :1]) * y)[0]) > 0.99
+    angles = np.linspace(0, 6, 20)
+    assert row_of(np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])) is None
+    assert (cell([50.0, 52.0]), cell([1.25]), cell([None, 3.0])) == ("51.0 (2.0)", "1.25", None)

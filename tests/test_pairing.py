@@ -8,11 +8,13 @@ from edgel_scenes import blank_views, distances_to, line, pixel_of, views_of
 from scipy.spatial import cKDTree
 
 from taichi_edges.corridor import train
+from taichi_edges.corridor.findings import describe_train
 from taichi_edges.corridor.pipeline import Run
 from taichi_edges.detectors.straight_runs import runs_of
 from taichi_edges.evidence.edgel_matching import EdgelMatching
 from taichi_edges.progress import Progress
 from taichi_edges.scene.settings import SceneConfig
+from taichi_edges.seeding import segments
 from taichi_edges.seeding.pairing import CANDIDATES, Segments, paired_runs
 from taichi_edges.seeding.proposals import propose_straight
 from taichi_edges.seeding.segments import fitted, is_shown, likely
@@ -70,10 +72,10 @@ def pixels_off(points, curves, views):
 def test_pairs_lie_on_the_edges_with_both_ends(taichi, generator):
     views = views_of(LINES, generator, noise_px=NOISE_PX, apart=1.0)
     runs = all_runs(views)
-    segments = paired_runs(views, runs)
-    _, counts = np.unique(segments.runs, return_counts=True)
+    found = paired_runs(views, runs)
+    _, counts = np.unique(found.runs, return_counts=True)
     assert counts.max() <= CANDIDATES and len(counts) > 0.95 * len(runs)
-    first = segments.keep(np.unique(segments.runs, return_index=True)[1])
+    first = found.keep(np.unique(found.runs, return_index=True)[1])
     off = pixels_off(first.ends.reshape(-1, 3), LINES, views)
     assert (off < 3.0).mean() > 0.95
 
@@ -132,18 +134,47 @@ def test_views_beside_each_other_show_an_edge_and_not_every_other_one(taichi, ge
     assert len(likely(matching, segment)) == shown[0]
 
 
-def test_no_training_leaves_the_gaussians_where_they_start(taichi, generator, tmp_path, monkeypatch):
-    views = views_of(LINES, generator, noise_px=NOISE_PX, apart=1.0)
-    source = {"reader": "colmap", "path": "anywhere"}
-    config = SceneConfig(name="still", source=source, train={"enabled": False, "seeds": "pair"})
-    (tmp_path / "run").mkdir()
-    run = Run(config, tmp_path / "run", threads=2, progress=Progress())
+def train_on(views, folder, monkeypatch, **settings):
+    """The run and the facts of its training on views that are there already."""
+    config = SceneConfig(name="still", source={"reader": "colmap", "path": "anywhere"}, train=settings)
+    run = Run(config, folder, threads=2, progress=Progress())
     monkeypatch.setattr(train, "read_views", lambda path: views)
     monkeypatch.setattr("taichi_edges.kernels.device.start_taichi", lambda *_: None)
-    facts = train.train(run)
+    return run, train.train(run)
+
+
+def test_no_training_leaves_the_gaussians_where_they_start(taichi, generator, tmp_path, monkeypatch):
+    views = views_of(LINES, generator, noise_px=NOISE_PX, apart=1.0)
+    run, facts = train_on(views, tmp_path, monkeypatch, enabled=False, seeds="pair")
     start, strokes = train.start_of_training(run, views, np.random.default_rng(0))
     assert facts == {"gaussians": len(start), "view_steps": 0, "final_loss": None} and len(np.unique(strokes)) == 3
-    assert (tmp_path / "run" / "train_log.csv").read_text().count("\n") == 1
+    assert (tmp_path / "train_log.csv").read_text().count("\n") == 1
+    assert describe_train(facts) == f"{len(start)} Gaussians, left where they start"
+
+
+def test_what_lies_on_no_stroke_is_trained_all_the_same(taichi, generator, tmp_path, monkeypatch):
+    views = views_of(LINES, generator, noise_px=NOISE_PX, apart=1.0)
+    maps = views.edge_maps.copy()
+    maps[:, views.height // 2, ::2] = 255  # training looks at maps, and these views have edgels only
+    views = replace(views, edge_maps=maps)
+    _, facts = train_on(views, tmp_path, monkeypatch, enabled=False, seeds="random", gaussians=200, steps=30)
+    assert facts["view_steps"] >= 30 and facts["final_loss"] is not None
+
+
+@pytest.mark.parametrize("strokes", [0, 1])
+def test_views_with_hardly_an_edgel_give_nothing(taichi, generator, strokes):
+    views = cluttered(without_edgels(5), generator, strokes)
+    assert len(propose_straight(views, EdgelMatching(views))) == 0
+
+
+def test_segments_are_judged_alike_however_many_at_once(taichi, generator, monkeypatch):
+    views = cluttered(views_of(LINES, generator, noise_px=NOISE_PX, apart=1.0), generator, strokes=20)
+    matching = EdgelMatching(views)
+    found = paired_runs(views, all_runs(views))
+    whole = likely(matching, found)
+    monkeypatch.setattr(segments, "AT_ONCE", 7 * len(views))
+    np.testing.assert_array_equal(likely(matching, found).ends, whole.ends)
+    assert len(whole) > 10
 
 
 def test_three_views_are_lifted_and_it_is_said(taichi, generator, tmp_path):

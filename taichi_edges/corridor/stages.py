@@ -50,7 +50,7 @@ STAGES = {
         on_device=True,
     ),
     "cluster": Stage(
-        ("filter", "cluster", "train.edge_threshold", "seed"),
+        ("filter", "cluster", "train.edge_threshold", "train.enabled", "seed"),
         ("gaussians.ply", "views.npz"),
         ("points.ply", "clusters.npz"),
         on_device=True,

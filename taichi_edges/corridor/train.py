@@ -24,12 +24,13 @@ def train(run: "Run") -> dict[str, Any]:
     start_taichi(run.arch, run.threads, run.config.seed, kernel_cache())
     start, strokes = start_of_training(run, views, generator)
     gaussians, records = start, list[LogRecord]()
-    if config.enabled:
+    trained = config.enabled or strokes is None  # what lies along no stroke is nowhere in particular yet
+    if trained:
         gaussians, records = Training(views, config, generator, run.threads, run.arch).run(start, run.progress)
     rows = [(r.step, f"{r.seconds:.3f}", f"{r.loss:.6f}", r.gaussians) for r in records]
     write_csv(run.path("train_log.csv"), [("step", "seconds", "loss", "gaussians"), *rows])
     similarity = views.similarity
-    in_order = not (config.enabled and config.density.changes_number)  # who is left, or a copy, has no place in it
+    in_order = not (trained and config.density.changes_number)  # who is left, or a copy, has no place in it
     write_gaussians(
         run.path("gaussians.ply"),
         similarity.to_input(gaussians.means.astype(np.float64)),

@@ -71,6 +71,8 @@ PHOTOGRAPHED: dict[str, dict[str, Any]] = {
         "enabled": False,
         "seeds": "pair",
         "gaussians": 60_000,
+        "steps": 200,  # of those that are trained, from points or because the scene wants it
+        "density": {"cull_opacity_at": [0.7], "cull_support_at": [0.5, 0.75]},
     },
     "filter": {
         "min_opacity": 0.2,

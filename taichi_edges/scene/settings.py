@@ -160,7 +160,9 @@ class TrainConfig(Section):
     the views agree, a few passes are enough: fast rates, one smooth decay, no duplication.
     """
 
-    enabled: bool = Field(True, description="false: the Gaussians stay where they start, as for photographs")
+    enabled: bool = Field(
+        True, description="false: Gaussians laid along strokes stay there, as for photographs; others are trained"
+    )
     epochs: Annotated[int, Field(ge=0)] = Field(0, description="passes over all views; 0: train.steps counts")
     steps: Annotated[int, Field(ge=0)] = Field(100, description="view steps, at least one pass; 0: train.epochs counts")
     settled: Share = Field(

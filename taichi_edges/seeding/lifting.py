@@ -20,7 +20,7 @@ import taichi as ti
 from taichi_edges.kernels.device import download, threads, upload
 from taichi_edges.kernels.points import F32_1D, F32_2D, F32_3D, I32_1D, I32_2D
 from taichi_edges.seeding.boxes import through_box
-from taichi_edges.views.cameras import NEAR, SWEPT_FROM, Cameras
+from taichi_edges.views.cameras import NEAR, TRIED_FROM, Cameras
 from taichi_edges.views.views import Views
 
 if TYPE_CHECKING:
@@ -386,7 +386,7 @@ def depth_ranges(views: Views, eye: np.ndarray, directions: np.ndarray) -> np.nd
     """
     grown = views.box + MARGIN * np.ptp(views.box, axis=0) * [[-1.0], [1.0]]
     near, far = through_box(eye, directions, grown)
-    near = np.maximum(near, SWEPT_FROM)
+    near = np.maximum(near, TRIED_FROM)
     meets = far > near
     depths = np.where(meets[:, None], np.column_stack([far, near]), 1.0)
     return np.where(meets[:, None], 1.0 / depths, [[1.0, 0.0]])

@@ -31,7 +31,7 @@ SHOWN, LEAST_VIEWS = 0.5, 4  # of its length in a view that shows a segment, and
 LEAST_EXCESS = 0.15  # share of the length, over all views in sight, that is shown beyond chance
 BESIDE = 3  # views that look from nearest to where another one looks from
 COHERENT = 0.55  # share of these that show a segment which this one shows, the mean over those that do
-AT_ONCE = 200_000  # places
+AT_ONCE = 1 << 20  # segments times views that are asked at once
 
 
 def places_on(segments: Segments, pixels: np.ndarray, every: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -125,19 +125,21 @@ def _shares(
     matching: "EdgelMatching", points: np.ndarray, ways: np.ndarray, own: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n, V) shares of the places on each segment that a view shows, and that it has in its image."""
-    count = len(ways)
-    totals = np.zeros((2, count, matching.edgels.view_count))
-    for first in range(0, len(points), AT_ONCE):
-        some = slice(first, first + AT_ONCE)
-        about = EdgelsAbout.of(matching, points[some], ways[own[some]], SHOWN_PX)
-        for total, there in zip(totals, (about.there, about.inside), strict=True):
-            total += np.stack([np.bincount(own[some], column, count) for column in there.T], axis=1)
-    return tuple(totals / np.maximum(np.bincount(own, minlength=count), 1)[:, None])
+    about, counts = EdgelsAbout.of(matching, points, ways[own], SHOWN_PX), np.bincount(own, minlength=len(ways))
+    shown, inside = (
+        np.stack([np.bincount(own, column, len(ways)) for column in there.T], axis=1) / counts[:, None]
+        for there in (about.there, about.inside)
+    )
+    return shown, inside
 
 
 def likely(matching: "EdgelMatching", segments: Segments) -> Segments:
     """Of each run that one of its Segments which the views show most, if they show any as they show edges."""
-    shown, excess = is_shown(matching, segments)
+    step = max(AT_ONCE // matching.edgels.view_count, 1)
+    parts = [is_shown(matching, segments.keep(slice(at, at + step))) for at in range(0, len(segments), step)]
+    if not parts:
+        return segments
+    shown, excess = (np.concatenate(column) for column in zip(*parts, strict=True))
     segments, excess = segments.keep(shown), excess[shown]
     order = np.lexsort((-excess, segments.runs))
     return segments.keep(np.sort(order[np.flatnonzero(np.diff(segments.runs[order], prepend=-1))]))

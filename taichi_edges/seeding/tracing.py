@@ -23,10 +23,10 @@ SHORTEST = 3  # edgels of a stroke
 
 @dataclass(frozen=True)
 class Strokes(Columns):
-    """Oriented points in order along strokes, each from one edgel.
+    """Oriented points in order along strokes, each from an edgel.
 
-    points, directions: (n, 3) unit cube, unit vectors. edgels: (n,) index into Edgels. numbers: (n,) of the stroke,
-    rising.
+    points, directions: (n, 3) unit cube, unit vectors. edgels: (n,) index into Edgels, -1 where a point is from a whole
+    run of them. numbers: (n,) of the stroke, rising.
     """
 
     points: np.ndarray

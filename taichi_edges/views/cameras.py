@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 # Near planes, in unit-cube units. `splatting/visibility.py` alone has another: what is in front at all hides nothing.
 NEAR = 0.01  # what is nearer counts as behind the camera
-SWEPT_FROM = 2 * NEAR  # inverse depths that are tried lie evenly: half of them would be nearer than this
+TRIED_FROM = 2 * NEAR  # inverse depths that are tried lie evenly: half of them would be nearer than this
 DRAWN_FROM = 5 * NEAR  # a nearer Gaussian would fill the image: it is not drawn, and its camera does not vote
 
 AT_ONCE = 4096  # points that are looked up in all views together
