@@ -31,7 +31,7 @@ SHOWN, LEAST_VIEWS = 0.5, 4  # of its length in a view that shows a segment, and
 LEAST_EXCESS = 0.15  # share of the length, over all views in sight, that is shown beyond chance
 BESIDE = 3  # views that look from nearest to where another one looks from
 COHERENT = 0.55  # share of these that show a segment which this one shows, the mean over those that do
-AT_ONCE = 1 << 20  # segments times views that are asked at once
+AT_ONCE = 1 << 17  # segments times views that are asked at once
 
 
 def places_on(segments: Segments, pixels: np.ndarray, every: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
